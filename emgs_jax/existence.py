@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import GaussianMap, without
 from emgs_jax.gaussians import blend, has_feature
-from emgs_jax.observation import Observation, depth_in
+from emgs_jax.observation import Observation, depth_range
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import (
     dot,
@@ -38,6 +38,7 @@ class ExistenceConfig(eqx.Module):
         hit: log-odds that a frame adds if the Gaussian explains some of its points.
         miss: log-odds that a frame takes away that sees through the Gaussian (free-space violation), or whose points it
             does not explain.
+        gone: likewise of a frame that sees a surface more than twice as far behind it as that takes.
         max_log_odds: upper limit, so that a bounded number of frames can outweigh any number of earlier ones.
         refuted: log-odds below which a Gaussian is removed; `-inf` never, as printed.
         num_std: k, standard deviations of the depth between a Gaussian and the surface that a frame sees, within which
@@ -55,6 +56,7 @@ class ExistenceConfig(eqx.Module):
     birth: Float[Array, "*b"] = traced(low=-1e6)
     hit: Float[Array, "*b"] = traced(low=0)
     miss: Float[Array, "*b"] = traced(low=0)
+    gone: Float[Array, "*b"] = traced(low=0)
     max_log_odds: Float[Array, "*b"] = traced(low=0)
     refuted: Float[Array, "*b"] = traced(low=-math.inf)
     num_std: Float[Array, "*b"] = traced(low=0)
@@ -80,20 +82,6 @@ class Look(NamedTuple):
     T_world_camera: jaxlie.SE3
     camera: Camera
     depth_noise: Float[Array, ""]
-
-
-def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -> Float[Array, "2 p"]:
-    """Nearest and farthest depth z (m) among each pixel and its eight neighbours; NaN where the pixel itself has none.
-
-    A pose that is wrong by a pixel must not show what is behind a thin pole.
-    """
-    depth = depth_in(T_world_camera, view).reshape(camera.height, camera.width)
-    valid = view.valid.reshape(depth.shape)
-
-    def least(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
-        return jax.lax.reduce_window(jnp.where(valid, depth, jnp.inf), jnp.inf, jax.lax.min, (3, 3), (1, 1), "SAME")
-
-    return jnp.where(valid, jnp.stack([least(depth), -least(-depth)]), jnp.nan).reshape(2, -1)
 
 
 def fusion_evidence(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> Int[Array, "n"]:
@@ -150,7 +138,9 @@ def update_existence(
     spread = 0.5 * (jnp.trace(gaussians.covs, axis1=-2, axis2=-1) - variance)  # variance along the surface
     has_points = spread >= (depth / camera.focal[0]) ** 2
     is_superfluous = is_seen & (use < 0) & (has_points | (map.existence <= 0))
+    is_gone = is_seen_through & (depth < nearest - 2.0 * reach)
     change = config.hit * ((use > 0) & ~is_seen_through) - config.miss * (is_seen_through | is_superfluous)
+    change = jnp.where(is_gone, -config.gone, change)
     existence = jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)
     existence = jnp.where(change == 0, map.existence, existence)
     updated = eqx.tree_at(lambda m: m.existence, map, existence)

@@ -105,6 +105,8 @@ class CoarsePose(eqx.Module):
         estimate: covariance of this pose and scale; the rest of the frame before.
         is_known: False where the prediction has no pose: this one is that of the frame before.
         is_usable: False where the prediction has no valid point or pose.
+        has_field: False where depths are triangulated with the poses, as the prior says by a scale that is certain:
+            then their errors are of pixels, and what looks like a field is the map's.
     """
 
     T_world_camera: jaxlie.SE3
@@ -116,6 +118,7 @@ class CoarsePose(eqx.Module):
     estimate: PoseEstimate
     is_known: Bool[Array, ""]
     is_usable: Bool[Array, ""]
+    has_field: Bool[Array, ""]
 
 
 class LocalizationInfo(eqx.Module):
@@ -280,7 +283,10 @@ def localize_coarse(
     has_newest = prediction.has_newest & is_finite & jnp.all(jnp.isfinite(newest.wxyz_xyz))
     newest = jaxlie.SE3(jnp.where(has_newest, newest.wxyz_xyz, coarse.wxyz_xyz))
     is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)
-    return CoarsePose(coarse, newest, scale, repeat_rms, mean_depth, depth_noise, estimate, is_finite, is_usable)
+    has_field = ~(is_sure & (prediction.scale_std == 0))
+    return CoarsePose(
+        coarse, newest, scale, repeat_rms, mean_depth, depth_noise, estimate, is_finite, is_usable, has_field
+    )
 
 
 def _corrected(current: Observation, field: DepthField, is_tracked: Bool[Array, ""]) -> Observation:
@@ -311,6 +317,8 @@ def localize_fine(
     known = root_information(coarse.estimate.covariance)
     start = CoarseStart(coarse.T_world_camera, known, coarse.depth_noise, coarse.estimate.is_given)
     fine, scale, info = icp(scaled, submap, start, config.icp, index)
+    nodes = jnp.where(coarse.has_field, info.field.nodes, 0.0)
+    info = eqx.tree_at(lambda i: i.field.nodes, info, nodes)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
     step_m, step_rad = (part @ safe_normalize(part) for part in (step[:3], step[3:]))

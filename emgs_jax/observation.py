@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
+from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.linalg import ROUNDED_CORRELATION, safe_normalize
 from emgs_jax.ops.neighbours import is_within_reach
 from emgs_jax.ops.precision import full_precision
@@ -230,6 +231,20 @@ def observe(
 def depth_in(T_world_camera: jaxlie.SE3, observation: Observation) -> Float[Array, "p"]:
     """Camera-space z (m) of world-frame points."""
     return ((observation.points - T_world_camera.translation()) @ T_world_camera.rotation().as_matrix())[:, 2]
+
+
+def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -> Float[Array, "2 p"]:
+    """Nearest and farthest depth z (m) among each pixel and its eight neighbours; NaN where the pixel itself has none.
+
+    A pose that is wrong by a pixel must not show what is behind a thin pole.
+    """
+    depth = depth_in(T_world_camera, view).reshape(camera.height, camera.width)
+    valid = view.valid.reshape(depth.shape)
+
+    def least(depth: Float[Array, "h w"]) -> Float[Array, "h w"]:
+        return jax.lax.reduce_window(jnp.where(valid, depth, jnp.inf), jnp.inf, jax.lax.min, (3, 3), (1, 1), "SAME")
+
+    return jnp.where(valid, jnp.stack([least(depth), -least(-depth)]), jnp.nan).reshape(2, -1)
 
 
 @full_precision

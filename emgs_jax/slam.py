@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.em import EmConfig, EmInfo, em_update, owners
 from emgs_jax.existence import ExistenceConfig, Look, fusion_evidence, merge_duplicates, update_existence
@@ -24,6 +24,7 @@ from emgs_jax.gaussian_map import (
 from emgs_jax.gaussians import FitConfig, GaussianIndex, Gaussians, cluster, index_of, spacing
 from emgs_jax.initialization import initialize
 from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
+from emgs_jax.motion import Looks, MotionConfig, find_movers, look_again, no_looks
 from emgs_jax.observation import (
     Observation,
     ObservationConfig,
@@ -57,6 +58,7 @@ class SlamConfig(eqx.Module):
         extrapolation: of depth errors to points that no Gaussian explains.
         splitting: of Gaussians that are too coarse for a nearer view.
         existence: evidence of later frames for and against a Gaussian.
+        motion: what is taken for moving: it neither aligns a frame nor becomes map.
     """
 
     window_size: int = static(low=1, high=1000)
@@ -70,6 +72,7 @@ class SlamConfig(eqx.Module):
     splitting: SplittingConfig
     refinement: RefinementConfig
     existence: ExistenceConfig
+    motion: MotionConfig
 
     @property
     def fusion(self) -> "FusionConfig":
@@ -92,6 +95,7 @@ class SlamState(eqx.Module):
         previous: the last frame as it was aligned, world frame.
         estimate: uncertainty of its pose and scale.
         time: frames so far, those that could not be placed included.
+        looks: of the frames before; None where nothing is taken for moving.
     """
 
     map: GaussianMap
@@ -99,6 +103,7 @@ class SlamState(eqx.Module):
     T_world_previous: jaxlie.SE3
     estimate: PoseEstimate
     time: Int[Array, ""]
+    looks: Looks | None = None
 
 
 class Overflow(eqx.Module):
@@ -115,6 +120,7 @@ class StepInfo(eqx.Module):
     Args:
         origin: median birth of the Gaussians that explain its points, its own if none do.
         num_left_out: points of the current frame that no map can hold, or with a number that is not finite.
+        moving: points that are taken for moving.
     """
 
     T_world_camera: jaxlie.SE3
@@ -125,6 +131,7 @@ class StepInfo(eqx.Module):
     origin: Int[Array, ""]
     num_gaussians: Int[Array, ""]
     num_left_out: Int[Array, ""]
+    moving: Bool[Array, "p"]
     overflow: Overflow
 
 
@@ -146,18 +153,25 @@ class Frame(eqx.Module):
 
     Args:
         points: its observation, world frame.
+        moving: rows that are taken for moving.
     """
 
     T_world_camera: jaxlie.SE3
     points: Observation
     localization: LocalizationInfo
     time: Int[Array, ""]
+    moving: Bool[Array, "p"]
 
     @property
-    def trusted(self) -> Observation:
+    def seen(self) -> Observation:
         """Its points, none of them valid where it is not tracked."""
         points = self.points
         return eqx.tree_at(lambda o: o.valid, points, points.valid & self.localization.is_tracked)
+
+    @property
+    def trusted(self) -> Observation:
+        """Those of them that are not taken for moving."""
+        return _without(self.seen, self.moving)
 
 
 class Fused(eqx.Module):
@@ -183,6 +197,10 @@ class NewGaussians(eqx.Module):
     halves: GaussianMap
 
 
+def _without(points: Observation, moving: Bool[Array, "p"]) -> Observation:
+    return eqx.tree_at(lambda o: o.valid, points, points.valid & ~moving)
+
+
 def _first_weight(weight: Float[Array, "g"], config: AverageConfig) -> Float[Array, "g"]:
     """Weight of a new Gaussian: α_0 = 1 as printed, or the number of images that its points amount to."""
     return jnp.where(config.gain > 0, weight, 1.0)
@@ -202,21 +220,28 @@ def init_state(
         The state, and how many Gaussians did not fit into the map's capacity.
     """
     gaussians, weight, world = initialize(views, T_world_views, camera, config.observation.thin, config.fit)
-    return _first_state(gaussians, weight, world, T_world_views, config)
+    view = downscale(camera, config.observation.thin)
+    return _first_state(gaussians, weight, world, T_world_views, view, config)
 
 
 @executable
 def _first_state(
-    gaussians: Gaussians, weight: Float[Array, "g"], world: Observation, T_world_views: jaxlie.SE3, config: SlamConfig
+    gaussians: Gaussians,
+    weight: Float[Array, "g"],
+    world: Observation,
+    T_world_views: jaxlie.SE3,
+    view: Camera,
+    config: SlamConfig,
 ) -> tuple[SlamState, Int[Array, ""]]:
     # There is nothing else to align the second frame with, so the first window confirms itself.
     existence = jnp.maximum(config.existence.birth, config.existence.hit)
     time = jnp.asarray(world.valid.shape[0], jnp.int32)
     new = new_map(gaussians, _first_weight(weight, config.em.average), existence, time - 1)
     map, _, overflow = insert(empty_map(config.submap.map_capacity, world.features.shape[-1]), new)
-    state = SlamState(
-        map, jax.tree.map(lambda leaf: leaf[-1], world), pose_row(T_world_views, -1), exact_estimate(), time
-    )
+    last, pose, looks = jax.tree.map(lambda leaf: leaf[-1], world), pose_row(T_world_views, -1), None
+    if (before := no_looks(last, config.motion)) is not None:
+        looks = look_again(before, last, jnp.zeros(last.valid.shape, bool), pose, pose, view)
+    state = SlamState(map, last, pose, exact_estimate(), time, looks)
     return state, overflow
 
 
@@ -237,7 +262,9 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         prediction, state.previous, state.T_world_previous, state.estimate, view, config.localization
     )
     submap = _select(state.map, state.previous, guess, config.submap)
-    frame = _localize_fine(current, submap, coarse, state.time, config.localization)
+    noise = state.estimate.depth_noise
+    moving = _find_movers(state.looks, current, state.T_world_previous, coarse, noise, view, config.motion)
+    frame = _localize_fine(current, moving, submap, coarse, state.time, config.localization)
     fused = _fuse(submap, frame, view, num_rows, config.fusion)
     candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
     refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement)
@@ -253,9 +280,11 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         origin=fused.origin,
         num_gaussians=num_gaussians,
         num_left_out=num_left_out,
+        moving=moving,
         overflow=Overflow(overflow, submap.overflow, refinement.overflow),
     )
-    return SlamState(map, frame.points, frame.T_world_camera, frame.localization.estimate, time), info
+    looks = None if state.looks is None else _look(state.looks, frame, state.T_world_previous, view)
+    return SlamState(map, frame.points, frame.T_world_camera, frame.localization.estimate, time, looks), info
 
 
 @executable
@@ -289,15 +318,45 @@ def _select(map: GaussianMap, previous: Observation, guess: Observation, config:
 
 
 @executable
+def _find_movers(
+    looks: Looks | None,
+    current: Observation,
+    T_world_previous: jaxlie.SE3,
+    coarse: CoarsePose,
+    depth_noise: Float[Array, ""],
+    view: Camera,
+    config: MotionConfig,
+) -> Bool[Array, "p"]:
+    """What moves in a frame at its coarse pose; `depth_noise` is that of the frame before."""
+    if looks is None:
+        return jnp.zeros(current.valid.shape, bool)
+    points = transform(jaxlie.SE3.identity(), current, coarse.scale)
+    estimate = replace(coarse.estimate, depth_noise=depth_noise)
+    T_previous_camera = T_world_previous.inverse() @ coarse.T_world_camera
+    return find_movers(looks, points, T_previous_camera, estimate, view, config)
+
+
+@executable
+def _look(looks: Looks, frame: Frame, T_world_previous: jaxlie.SE3, view: Camera) -> Looks:
+    return look_again(looks, frame.seen, frame.moving, frame.T_world_camera, T_world_previous, view)
+
+
+@executable
 def _localize_fine(
-    current: Observation, submap: Submap, coarse: CoarsePose, time: Int[Array, ""], config: LocalizationConfig
+    current: Observation,
+    moving: Bool[Array, "p"],
+    submap: Submap,
+    coarse: CoarsePose,
+    time: Int[Array, ""],
+    config: LocalizationConfig,
 ) -> Frame:
     """The frame at its fine pose, against what is confirmed."""
     target = confirmed(submap.map)
     groups = group_points(target.means, target.valid, order_of(submap.index.groups, target.valid.shape[0]))
     index = GaussianIndex(submap.index.white, groups)
-    T, aligned, localization = localize_fine(current, target, coarse, config, index)
-    return Frame(T, aligned, localization, time)
+    T, aligned, localization = localize_fine(_without(current, moving), target, coarse, config, index)
+    points = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid | moving & coarse.is_usable)
+    return Frame(T, points, localization, time, moving)
 
 
 @executable
@@ -348,7 +407,7 @@ def _store(
     """
     rows, T, noise = submap.rows, frame.T_world_camera, frame.localization.depth_noise
     evidence, map = fusion_evidence(map, submap.map, rows), write_back(map, submap.map, rows)
-    map, is_seen = update_existence(map, evidence, Look(frame.trusted, T, view, noise), config.existence)
+    map, is_seen = update_existence(map, evidence, Look(frame.seen, T, view, noise), config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
     merged = merge_duplicates(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
     born = new_map(new.gaussians, _first_weight(new.weight, config.em.average), config.existence.birth, frame.time)

@@ -12,6 +12,7 @@ GROUPS = {
         "mapping/test_budgets.py",  # counts what is compiled, so it clears what others compiled
         "scripts/test_run.py",
         "mapping/test_pipeline.py",
+        "mapping/test_moving_scenes.py",
         "mapping/test_checkpoint.py",
         "scripts/test_query_and_segment.py",
         "scripts/test_sweep_script.py",
@@ -36,6 +37,9 @@ GROUPS = {
 # What the quick subset (-m "not slow") takes nothing of, beside the marked tests: some five CPU seconds and more each.
 SLOW = {
     "data/test_apartment.py",
+    "data/test_movers.py",
+    "mapping/test_moving_scenes.py",
+    "test_motion.py",
     "data/test_rosbag.py",
     "features/test_dino.py",
     "features/test_dinotxt.py",

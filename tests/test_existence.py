@@ -107,7 +107,7 @@ def test_a_slab_before_a_mapped_wall_goes_within_20_looks_and_wall_and_pole_stay
 
 
 def test_a_fresh_wrong_gaussian_goes_sooner_and_one_that_explains_is_confirmed(settings):
-    map = map_of(discs([(0, 0, 3.0), (0.2, 0, 1.5)]), existence=float(settings.birth))
+    map = map_of(discs([(0, 0, 3.0), (0.2, 0, 2.7)]), existence=float(settings.birth))
     assert not is_confirmed(map).any()
     map, is_seen = judged(map, 1, look(3.0), HERE, CAMERA, NOISE, settings)
     np.testing.assert_array_equal(is_seen, [True, False])
@@ -163,9 +163,18 @@ def test_at_an_edge_of_depth_both_surfaces_are_seen_though_a_pixel_shows_one(set
 
 
 def test_what_is_seen_through_is_not_confirmed_by_what_it_explains(settings):
-    map = map_of(discs((0, 0, 2.0)))
+    map = map_of(discs((0, 0, 2.7)))
     after, _ = judged(map, 1, look(3.0), HERE, CAMERA, NOISE, settings)
     np.testing.assert_allclose(after.existence, np.asarray(map.existence) - settings.miss, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "depth, change", [(2.0, 0.0), (2.2, -0.35), (3.0, -3.0)], ids=["on it", "behind", "far behind"]
+)
+def test_what_is_gone_goes_within_a_few_looks(settings, depth, change):
+    map = map_of(discs([[0.0, 0.0, 2.0]]), existence=2.0)
+    after, _ = judged(map, 0, look(depth), HERE, CAMERA, NOISE, settings)
+    assert after.existence[0] == pytest.approx(2.0 + change)
 
 
 def test_usefulness_is_what_a_frame_fused_into_each_row_of_its_submap():

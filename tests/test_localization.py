@@ -10,6 +10,7 @@ import scene as sc
 from emgs_jax.gaussians import fit_to_points
 from emgs_jax.localization import REASONS, localize_coarse, localize_fine
 from emgs_jax.ops.camera import Camera
+from emgs_jax.registration.depth_field import field_at
 from emgs_jax.registration.icp import icp
 from emgs_jax.registration.pose_estimate import exact_estimate, root_information
 from emgs_jax.registration.pose_noise import no_repeats
@@ -439,8 +440,26 @@ def test_the_fine_step_is_icp_of_the_scaled_points_with_the_noise_of_the_coarse_
     np.testing.assert_allclose(info.scale, coarse_scale * scale, rtol=1e-4)
     np.testing.assert_allclose(info.depth_noise, found.misfit, rtol=1e-2)
     np.testing.assert_allclose(info.noise, np.full(info.noise.shape, found.misfit), rtol=1e-2)  # equal confidences
-    np.testing.assert_allclose(aligned.points, sc.moved_points(T, current, info.scale).points, atol=1e-5)
+    f = sc.on_host(field_at)(info.icp.field, current.points)
+    assert 0.01 < np.abs(f).max() < 0.2, "prediction and map differ by 4 %, and more at corners of a coarse map"
+    without = sc.replace(current, points=np.asarray(current.points) * np.exp(-f)[:, None])
+    np.testing.assert_allclose(aligned.points, sc.moved_points(T, without, info.scale).points, atol=1e-5)
     assert info.is_tracked and info.repeat_rms == coarse.repeat_rms
+
+
+@pytest.mark.parametrize(("scale_std", "has_field"), [(0.0, False), (1e-3, True), (np.nan, True)])
+def test_depths_that_are_triangulated_have_no_field(camera, submap, lenient, scale_std, has_field):
+    settings = sc.changed(lenient, **{"icp.prior_information": 30.0})
+    sure = {"pose_covariance": np.tile(1e-6 * np.eye(6), (2, 1, 1)), "scale_std": np.float32(scale_std)}
+    current = nudged(camera).current
+    points = np.asarray(current.points)
+    current = sc.replace(current, points=points * np.exp(0.2 * points[:, :1] / points[:, 2:]))
+    prediction = eqx.tree_at(lambda p: p.current, sc.replace(nudged(camera), **sure), current)
+    coarse, T, aligned, info = fine_of(prediction, submap, camera, settings)
+    assert coarse.has_field == has_field == bool(np.abs(info.icp.field.nodes).max() > 1e-3)
+    if not has_field:
+        moved = sc.moved_points(T, current, info.scale).points
+        np.testing.assert_allclose(aligned.points, moved, atol=1e-5)
 
 
 def test_a_scale_that_is_accepted_is_that_of_the_points_and_one_that_is_not_is_dropped(camera, submap, lenient):

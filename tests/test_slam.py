@@ -143,8 +143,9 @@ def test_candidates_come_from_the_points_that_em_left_over(stepped):
 def test_a_new_gaussian_weighs_as_many_images_as_its_points_amount_to_or_one_as_printed(state, settings):
     """Clusters hold some number of points, of which λ are one image's; in all no more than there are."""
     held = np.asarray(state.map.gaussians.valid)
-    # So that EM and the image plane fuse nothing.
+    # So that EM and the image plane fuse nothing, and no row becomes free.
     apart = sc.changed(settings, **{"em.max_mahalanobis_sq": 0.0, "refinement.max_mahalanobis_sq_2d": 0.0})
+    apart = sc.at(apart, "existence.refuted", -np.inf)
     new, info = step(state, exact(FRAME), FULL, apart)
     fresh = np.asarray(new.map.gaussians.valid) & ~held
     assert info.em.num_fused == 0 and fresh.sum() == info.refinement.num_fresh > 50
@@ -350,6 +351,22 @@ def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera):
         ratios.append([np.median(ours) / np.median(raw), np.quantile(ours, 0.9) / np.quantile(raw, 0.9)])
     # Twelve frames see a wall, with errors that are independent but for the path's: a third is the most to hope for.
     assert np.all(np.mean(ratios, axis=0) < 0.7), ratios
+
+
+def test_a_field_of_the_first_frames_fades_from_the_map(camera):
+    """Three frames whose depths slope by 8 %, then eight that are exact, at exact poses: the map becomes their mean."""
+    chosen = sc.changed(sc.slam_config(*WHOLE, "slam.em.average.gain=count"), **LENIENT)
+    poses = [sc.path_pose(i) for i in range(FRAME)]
+    slope = np.exp(np.linspace(-0.08, 0.08, camera.width))[None, :, None] * np.ones((camera.height, 1, 1))
+    views = [sc.observe_room(T, camera, num_features=2) for T in poses]
+    views = [sc.replace(o, points=o.points * slope.reshape(-1, 1)) for o in views]
+    sure = {"pose_covariance": np.tile(1e-8 * np.eye(6), (2, 1, 1)), "scale_std": np.float32(1e-4)}
+    sequence = [sc.replace(exact(FRAME + i), **sure) for i in range(8)]
+    _, infos = run([sc.first_window(sc.stack(views), sc.stack_poses(poses)), *sequence], chosen)
+    assert all(i.localization.is_tracked for i in infos)
+    sizes = [float(np.abs(i.localization.icp.field.nodes).max()) for i in infos]
+    assert 0.06 < sizes[0] < 0.1, "what the map differs from the frame"
+    assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 0.5 * sizes[0], "3 of 11 frames are wrong"
 
 
 # What a step is compiled for.

@@ -208,8 +208,11 @@ def cell_numbers(points: np.ndarray, voxel: float) -> np.ndarray:
 
 def cell_centers(numbers: np.ndarray, voxel: float) -> np.ndarray:
     """Centres (n, 3) of the voxels with these `cell_numbers`."""
-    index = (numbers[:, None] >> np.array([42, 21, 0])) & (2**21 - 1)
-    return (index - 2**20 + 0.5) * voxel
+    centers = np.empty((len(numbers), 3))
+    for axis, shift in enumerate((42, 21, 0)):  # by itself, as there may be tens of millions
+        centers[:, axis] = ((numbers >> shift) & (2**21 - 1)) - 2**20 + 0.5
+    centers *= voxel
+    return centers
 
 
 class NearestPoints:

@@ -186,6 +186,8 @@ def align_points(
     """Bring points (n, 3) of the estimate to where `compare_clouds` compares its cloud."""
     alignment, _ = align_poses(*poses, with_scale=config.alignment == "sim3")
     aligned = alignment.apply(points)
+    if config.icp_distance_m == 0:
+        return aligned
     return _moved(coarse_points([aligned], config.icp_voxel_m), truth, config.icp_distance_m, config).apply(aligned)
 
 

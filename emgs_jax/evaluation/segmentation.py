@@ -21,6 +21,7 @@ from emgs_jax.geometry import rotated
 from emgs_jax.io.ply_reader import read_vertices
 
 _VOTED_ROWS = 200_000  # points that are given a class together: bounds the memory, does not change the result
+_SEEN = np.dtype([("cell", np.int64), ("label", np.int32), ("views", np.int32)])  # a class in a voxel, by so many views
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
 
 
@@ -117,33 +118,40 @@ class LabelGrid:
     """Counts which classes are seen in each voxel [m] of the world, once a view."""
 
     def __init__(self, voxel: float) -> None:
-        self._voxel = voxel
-        self._rows = [np.empty((0, 3), np.int64)]  # class, cell, number of views; the first is what was merged
+        self._voxel, self._rows = voxel, [np.empty(0, _SEEN)]  # the first is what was merged
 
     def add(self, points: np.ndarray, labels: np.ndarray) -> None:
         """Add a view: points (n, 3) and their classes (n,); what has none or is not finite is left out."""
         known = (labels >= 0) & np.isfinite(points).all(-1)
-        rows = _distinct(np.column_stack([labels[known], cell_numbers(points[known], self._voxel)]))
-        self._rows.append(np.column_stack([rows, np.ones(len(rows), np.int64)]))
-        if sum(map(len, self._rows[1:])) > max(_MERGE_ROWS, len(self._rows[0])):
-            self._rows = [self._merged()]
+        pairs = _distinct(np.column_stack([labels[known], cell_numbers(points[known], self._voxel)]))
+        rows = np.ones(len(pairs), _SEEN)
+        rows["label"], rows["cell"] = pairs.T
+        self._rows.append(rows)
+        if sum(map(len, self._rows[1:])) > max(_MERGE_ROWS, len(self._rows[0]) // 2):
+            self._merge()
 
     def points(self, classes: Sequence[str]) -> LabelledPoints:
         """The centre of every voxel with the class of most views; of equally frequent ones the first."""
-        labels, cells, views = self._merged().T
-        begins = np.flatnonzero(np.diff(cells, prepend=-1))
+        rows = self._merge()
+        begins = np.flatnonzero(np.diff(rows["cell"], prepend=-1))
+        labels = np.empty(0, np.int64)
         if len(begins):
-            most = np.repeat(np.maximum.reduceat(views, begins), np.diff(begins, append=len(cells)))
-            labels = np.minimum.reduceat(np.where(views == most, labels, np.iinfo(np.int64).max), begins)
-        return LabelledPoints(cell_centers(cells[begins], self._voxel), labels, tuple(classes))
+            most = np.repeat(np.maximum.reduceat(rows["views"], begins), np.diff(begins, append=len(rows)))
+            labels = np.where(rows["views"] == most, rows["label"], np.iinfo(np.int32).max)
+            labels = np.minimum.reduceat(labels, begins).astype(np.int64)
+        return LabelledPoints(cell_centers(rows["cell"][begins], self._voxel), labels, tuple(classes))
 
-    def _merged(self) -> np.ndarray:
-        """Rows by cell and class, each pair once."""
-        rows = np.concatenate(self._rows)
-        rows = rows[np.lexsort(rows.T[:2])]
-        begins = _changes(rows[:, :2])
-        views = np.add.reduceat(rows[:, 2], begins) if len(begins) else rows[:, 2]
-        return np.column_stack([rows[begins, :2], views])
+    def _merge(self) -> np.ndarray:
+        """Rows by cell and class, each pair once, which are kept; of a long walk they are gigabytes."""
+        rows, self._rows = np.concatenate(self._rows), []
+        rows = rows[np.lexsort((rows["label"], rows["cell"]))]
+        is_new = (np.diff(rows["cell"], prepend=-1) != 0) | (np.diff(rows["label"], prepend=-1) != 0)
+        begins = np.flatnonzero(is_new)
+        merged = rows[begins]
+        if len(begins):
+            merged["views"] = np.add.reduceat(rows["views"], begins)
+        self._rows = [merged]
+        return merged
 
 
 class SpooledLabels:
@@ -223,12 +231,7 @@ def segmentation_metrics(confusion: np.ndarray, ignored: Collection[int] = ()) -
 def _distinct(rows: np.ndarray) -> np.ndarray:
     """Each row (n, 2) once, ordered by the second column; as `np.unique` along an axis, in a fifth of its time."""
     rows = rows[np.lexsort(rows.T)]
-    return rows[_changes(rows)]
-
-
-def _changes(rows: np.ndarray) -> np.ndarray:
-    """Positions of the rows (n, 2) of numbers from 0 on that differ from the row before."""
-    return np.flatnonzero((np.diff(rows, axis=0, prepend=-1) != 0).any(1))
+    return rows[(np.diff(rows, axis=0, prepend=-1) != 0).any(1)]
 
 
 def read_labelled_mesh(folder: Path, scene: str, classes: ClassFile) -> LabelledPoints:

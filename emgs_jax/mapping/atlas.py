@@ -37,8 +37,9 @@ from emgs_jax.mapping.world import (
     place_world,
     step_prediction,
 )
+from emgs_jax.motion import no_looks
 from emgs_jax.observation import Observation, Prediction, no_covariance, transform, unknown_scale
-from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.registration.pose_estimate import exact_estimate, rescale_estimate
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
@@ -60,13 +61,15 @@ class Submap:
     worlds: Mapping[int, World] = field(default_factory=dict)
 
 
-def unvisited(saved: SavedMap) -> Submap:
-    """Make the submap of a saved map, in which no frame was found yet."""
-    width, count = saved.map.gaussians.features.shape[-1], len(saved.back_end.nodes)
+def unvisited(saved: SavedMap, camera: Camera, config: SlamConfig) -> Submap:
+    """Make the submap of a saved map, in which no frame of this camera was found yet."""
+    view, time = downscale(camera, config.observation.thin), jnp.asarray(len(saved.back_end.nodes), jnp.int32)
+    size, width = view.width * view.height, saved.map.gaussians.features.shape[-1]
     estimate = replace(exact_estimate(), depth_noise=jnp.asarray(saved.depth_noise, jnp.float32))
-    nothing = Observation(*(jnp.zeros((0, size)) for size in (3, 3, 3, width)), jnp.zeros(0), jnp.zeros(0, bool))
-    time = jnp.asarray(count, jnp.int32)
-    return Submap(SlamState(saved.map, nothing, jaxlie.SE3.identity(), estimate, time), saved.is_fixed)
+    arrays = (jnp.zeros((size, columns)) for columns in (3, 3, 3, width))
+    nothing = Observation(*arrays, jnp.zeros(size), jnp.zeros(size, bool))
+    known = nothing, jaxlie.SE3.identity(), estimate, time, no_looks(nothing, config.motion)
+    return Submap(SlamState(saved.map, *known), saved.is_fixed)
 
 
 @dataclass(frozen=True)

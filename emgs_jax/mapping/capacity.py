@@ -17,6 +17,7 @@ from emgs_jax.device.executables import call, outputs, ready
 from emgs_jax.device.fingerprint import fingerprint
 from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert
 from emgs_jax.mapping.convert import FirstWindow
+from emgs_jax.motion import no_looks
 from emgs_jax.observation import Prediction, no_covariance, transform, unknown_scale
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
@@ -109,7 +110,8 @@ def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None
     key = fingerprint(step), jax.tree.structure((map, view, config)), shapes
     if key in _prepared:
         return
-    state = SlamState(map, view, pose, _zeros(jax.eval_shape(exact_estimate)), on_device(np.int32(0)))
+    looks = _zeros(jax.eval_shape(lambda: no_looks(view, config.motion)))
+    state = SlamState(map, view, pose, _zeros(jax.eval_shape(exact_estimate)), on_device(np.int32(0)), looks)
     with calling(note):
         step(state, prediction, camera, config)
     with ThreadPoolExecutor(os.cpu_count()) as threads:

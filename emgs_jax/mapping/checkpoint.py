@@ -25,6 +25,7 @@ from emgs_jax.mapping.atlas import Atlas, Submap
 from emgs_jax.mapping.records import FrameRecord, with_moved_nodes
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.mapping.world import World
+from emgs_jax.motion import Looks
 from emgs_jax.observation import Observation
 from emgs_jax.ops.ranges import number
 from emgs_jax.pose_graph.optimize import PoseGraphInfo
@@ -34,7 +35,7 @@ from emgs_jax.slam import SlamState
 
 CHECKPOINT_FILE = "checkpoint.npz"
 FORMAT, VERSION = "emgs_jax.checkpoint", 8
-OF_MAPS = (Submap, World, SlamState, GaussianMap, Gaussians, Observation, PoseEstimate, Repeats, jaxlie.SE3)
+OF_MAPS = (Submap, World, SlamState, GaussianMap, Gaussians, Observation, Looks, PoseEstimate, Repeats, jaxlie.SE3)
 OF_GRAPH = (BackEnd, Node, Factor, LoopMeasurement, Refusal, Closure, PoseGraphInfo, Database, Keyframe)
 
 

@@ -23,10 +23,12 @@ from emgs_jax.slam import StepInfo
 IN_MAP = ("tracked", "initialization")  # statuses of frames that the map holds
 APART = "apart"  # status of a frame that a submap holds which was never joined with the map
 UNPLACED = ("lost", APART)  # statuses of frames whose pose says nothing in the map
+HIDDEN = "moving things fill the view"
 NOT_FOUND = "its place in the saved map is not found"
 UNJOINED = "its submap was never joined with the map (unjoined)"
 MANY_IN_A_ROW = 10  # single frames fail in every long sequence, so many together do not
 UNTRACKED = ("degraded", "lost")
+MOST_MOVING = 0.5  # of the pixels; where more move it is they that hide the map
 REMEDIES = dict(
     zip(
         REASONS,
@@ -44,6 +46,7 @@ REMEDIES = dict(
         strict=True,
     )
 ) | {
+    HIDDEN: "nothing is mapped until they are gone, or are no longer seen to move",
     NOT_FOUND: "take images of the same place, or map it anew without map=",
     UNJOINED: "take images that lead from there to the rest, closer together (dataset.stride=…)",
 }
@@ -76,6 +79,7 @@ class FrameRecord:
         origin: frame whose Gaussians it was registered to (median of their births), counted from the map's first one.
         repeat_rms: robust standard deviation between the two predictions of the previous image, m.
         left_out: pixels with a prediction that is not finite, behind the camera or farther than a map can hold.
+        moving: share of the pixels that are taken for moving.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
         mean_log_joint: of the fused points with their best Gaussians.
@@ -110,6 +114,7 @@ class FrameRecord:
     origin: int | None = None
     repeat_rms: float | None = None
     left_out: int = 0
+    moving: float | None = None
     fused: int | None = None
     updated: int | None = None
     mean_log_joint: float | None = None
@@ -165,6 +170,8 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
     """Return the fields of a record that a step fills; `info` is on the host."""
     localization, em, refinement = info.localization, info.em, info.refinement
     reasons = [words for bit, words in enumerate(REASONS) if int(localization.reason) >> bit & 1]
+    moving = float(np.mean(info.moving))
+    reasons = [HIDDEN] if reasons and moving > MOST_MOVING else reasons
     return {
         "status": "tracked" if localization.is_tracked else "lost" if localization.is_lost else "degraded",
         "reason": "; ".join(reasons) or None,
@@ -175,6 +182,7 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
         "step_m": float(localization.step_m),
         "step_rad": float(localization.step_rad),
         "repeat_rms": float(localization.repeat_rms),
+        "moving": moving,
         "fused": int(em.num_fused),
         "updated": int(em.num_updated),
         "mean_log_joint": float(em.mean_log_joint) if em.num_fused else None,

@@ -117,7 +117,9 @@ def new_run(
     if config.initialization == "merged":
         raise ValueError("map= places one view after the other: use slam.initialization=incremental with it")
     config = replace(config, submap=replace(config.submap, map_capacity=saved.map.weight.shape[0]))
-    return MappingRun(Atlas(camera, config, replace(saved.back_end, active=None), {0: unvisited(saved)}), clock)
+    return MappingRun(
+        Atlas(camera, config, replace(saved.back_end, active=None), {0: unvisited(saved, camera, config)}), clock
+    )
 
 
 def clamped(config: SlamConfig, camera: Camera) -> list[str]:

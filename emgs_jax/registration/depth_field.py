@@ -10,7 +10,7 @@ from emgs_jax.ops.precision import full_precision
 
 NUM_NODES = 5  # along each side of the image
 NUM_ROUNDS = 3  # of weights and field in turn
-NUM_ALIKE = 20.0  # neighbouring points that err alike, beside the field: so many count as one
+NUM_INDEPENDENT = 160  # errors in an image beside the field: neighbouring points err alike
 LEAST_SIDE = 1e-6  # of the image, in focal lengths
 
 
@@ -76,7 +76,8 @@ def depth_field(
     """Estimate the field of a frame from how far its points are from the map, as a Gaussian process on the nodes.
 
     A network errs by a scale that drifts and by a field that is smooth over the image, ρ = B f + noise, with bilinear
-    weights B and the precision W = 1 / (σ² + (ρ - B f)²/4) / `NUM_ALIKE` of each point, Cauchy's:
+    weights B. The precision W of each point is Cauchy's, 1 / (σ² + (ρ - B f)²/4), over the number of points that err
+    alike:
 
         f = K (1 + B'WB K)⁻¹ B'W ρ,   K = v exp(-½ |i - j|² / length²)
 
@@ -86,7 +87,7 @@ def depth_field(
     Args:
         points: camera frame.
         errors: ρ, log of each point's depth over that of the map along its ray.
-        noise: σ of each error beside the field; above 0.
+        noise: σ of each error, that of the field included: a field has to be clear of it; above 0.
         valid: which errors are known.
         length: over which the field is alike, as a fraction of the image's side.
     """
@@ -102,8 +103,10 @@ def depth_field(
     place = jnp.stack(jnp.meshgrid(*[jnp.linspace(0.0, 1.0, NUM_NODES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
     apart = jnp.sum((place - place[:, None]) ** 2, axis=-1)
 
+    alike = jnp.maximum(jnp.sum(is_before) / NUM_INDEPENDENT, 1.0)
+
     def fit(nodes: Float[Array, "n"], _: None) -> tuple[Float[Array, "n"], None]:
-        precision = is_before / (noise**2 + (0.5 * (errors - basis @ nodes)) ** 2) / NUM_ALIKE
+        precision = is_before / (noise**2 + (0.5 * (errors - basis @ nodes)) ** 2) / alike
         weighted = basis * precision[:, None]
         total = jnp.sum(weighted, axis=0)
         is_seen = total > 0
@@ -112,7 +115,7 @@ def depth_field(
         chance = jnp.sum(share * is_seen / jnp.where(is_seen, total, 1.0))
         variance = jnp.maximum(jnp.sum(share * mean**2) - chance, 0.0)
         prior = variance * jnp.exp(-0.5 * apart / length**2)
-        known = weighted.T @ basis @ prior
+        known = basis.T @ weighted @ prior
         return prior @ jnp.linalg.solve(jnp.eye(NUM_NODES**2) + known, errors @ weighted), None
 
     nodes, _ = jax.lax.scan(fit, jnp.zeros(NUM_NODES**2), length=NUM_ROUNDS)

@@ -21,6 +21,7 @@ from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, aligned, me
 from emgs_jax.report.provenance import has_metric_truth, lines_of
 
 MANY = 0.1  # share of frames
+MUCH = 0.03  # share of pixels; less may be wrong predictions
 
 
 def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
@@ -48,6 +49,12 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
         lines.append(
             f"{count} points of {len(left_out)} frames, from {called(left_out[0])} on, were left out: the prior's "
             f"depth there is not finite, not positive, or farther than a map can hold ({MAX_LENGTH_M:g} m)"
+        )
+    if moving := [record for record in records if (record.moving or 0.0) >= MUCH]:
+        most = max(moving, key=lambda record: record.moving)
+        lines.append(
+            f"in {len(moving)} frames something moves, most of it in {called(most)} ({100 * most.moving:.0f} % of the "
+            "pixels): it is not mapped; `moving` in frames.jsonl, slam/motion=paper takes all for static"
         )
     return lines
 

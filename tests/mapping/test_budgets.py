@@ -67,11 +67,12 @@ def test_a_warm_run_compiles_nothing_and_has_the_bits_of_a_cold_one(runs):
 def test_a_run_makes_no_more_executables_than_it_did(runs):
     """33 when this was written: two thirds are kept functions, the rest an operation that the host asks for each.
 
-    Two more fill the covariances of a prior that does not say how sure it is of its poses.
+    Two more fill the covariances of a prior that does not say how sure it is of its poses, and two find what moves and
+    keep the frame to look for that in the next.
 
     A further one costs .05 to .5 s of every first run, so who adds some says why here.
     """
-    assert runs.cold.events["compile_requests_use_cache"] <= 36
+    assert runs.cold.events["compile_requests_use_cache"] <= 38
 
 
 def test_a_frame_is_read_once(runs):

@@ -55,7 +55,8 @@ def some_map():
 def saved(map) -> Submap:
     """A saved map of seven frames, before one is found in it."""
     end = SimpleNamespace(nodes=[None] * 7)
-    return unvisited(SimpleNamespace(map=map, back_end=end, depth_noise=0.02, is_fixed=False))
+    one = SimpleNamespace(map=map, back_end=end, depth_noise=0.02, is_fixed=False)
+    return unvisited(one, CAMERA, load_config().slam)
 
 
 def lost_state() -> SlamState:

@@ -63,6 +63,13 @@ def test_a_remedy_names_keys_that_there_are():
     assert len(keys) > 5 and keys <= known
 
 
+def test_what_moves_is_said():
+    shares = {"a/0.png": 0.0, "a/1.png": 0.2, "a/2.png": 0.004}
+    given = [FrameRecord(0, name, 0.0, "tracked", moving=share) for name, share in shares.items()]
+    _, said = frame_lines(given, 0)
+    assert said.startswith("in 1 frames something moves, most of it in 1.png (20 % of the pixels)")
+
+
 def test_points_that_no_map_can_hold_are_counted_in_the_last_words():
     given = [*records(tracked=2), FrameRecord(5, "a/sky.png", 0.0, "tracked", left_out=30)]
     _, said = frame_lines(given, 0)

@@ -14,7 +14,7 @@ from tools.mutants.operators import Edit, changed, edits
 
 ROOT = Path(__file__).resolve().parents[2]
 CORE = "ops observation gaussians gaussian_map registration pose_graph render initialization localization em"
-CORE = {*CORE.split(), "surface_extrapolation", "splitting", "refinement", "existence", "semantics", "slam"}
+CORE = {*CORE.split(), "surface_extrapolation", "splitting", "refinement", "existence", "motion", "semantics", "slam"}
 CORE_SHARE = 0.5  # of a sample; the core is a fifth of the source, and an error in it the hardest to see
 MOST_OF_A_KIND = 0.15  # of a sample; a third of all places are numbers
 

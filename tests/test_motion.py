@@ -1,0 +1,131 @@
+"""What stands where earlier frames looked through moves; what does not, or is only wrong, does not."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from scene import device, on_host, pose, replace
+
+from emgs_jax.motion import Looks, find_movers, look_again, no_looks
+from emgs_jax.observation import Observation, transform
+from emgs_jax.ops.camera import Camera
+from emgs_jax.registration.pose_estimate import exact_estimate
+
+CAMERA = Camera([40.0, 44.0], [31.5, 23.5], 64, 48)
+WALL, NUM_LOOKS = np.full((48, 64), 3.0), 12
+ROWS, COLUMNS = np.indices((48, 64))
+BLOCK = (abs(ROWS - 24) < 12) & (abs(COLUMNS - 30) < 9)
+NOTHING = np.zeros((48, 64), bool)
+moved, looked = (on_host(f) for f in (find_movers, look_again))
+
+
+@pytest.fixture(scope="module")
+def settings(config):
+    return config(f"slam.motion.num_looks={NUM_LOOKS}").motion
+
+
+def seen(depth, valid=True) -> Observation:
+    """A depth image (h, w) in its own camera."""
+    depth = np.asarray(depth, float)
+    rays = np.stack([(COLUMNS - 31.5) / 40, (ROWS - 23.5) / 44, np.ones_like(depth)], axis=-1)
+    rows, count = (rays * depth[..., None]).reshape(-1, 3), depth.size
+    o = np.zeros((count, 3)), np.zeros((count, 3)), np.zeros((count, 0)), np.ones(count)
+    return Observation(*map(device, (rows, *o)), device(np.broadcast_to(valid, depth.shape).reshape(-1)))
+
+
+def with_block(depth=2.0, where=BLOCK, wall=WALL):
+    return np.where(where, depth, wall)
+
+
+def after(views, settings, masks=(), poses=()) -> Looks:
+    """Looks at depth images, oldest first, with what was taken for moving in them, from poses in the world."""
+    looks, last = no_looks(seen(WALL), settings), pose()
+    for number, depth in enumerate(views):
+        T = poses[number] if len(poses) else pose()
+        mask = device((masks[number] if len(masks) else NOTHING).reshape(-1))
+        looks, last = look_again(looks, transform(T, seen(depth), device(1.0)), mask, T, last, CAMERA), T
+    return looks
+
+
+def found(looks, depth, settings, noise=0.02, std=0.0, T_previous_camera=None) -> np.ndarray:
+    """Image of what moves in a depth image."""
+    estimate = replace(exact_estimate(), depth_noise=device(noise), covariance=device(std**2 * np.eye(7)))
+    T = pose() if T_previous_camera is None else T_previous_camera
+    return moved(looks, seen(depth), T, estimate, CAMERA, settings).reshape(48, 64)
+
+
+def walking(count):
+    """A block that goes right by 3 pixels a frame."""
+    return [with_block(where=np.roll(BLOCK, 3 * step - 20, axis=1)) for step in range(count)]
+
+
+HERE = with_block()
+CASES = {
+    "nothing new": ([WALL] * 5, WALL, {}, NOTHING),
+    "a block where a wall was seen": ([WALL] * 5, HERE, {}, BLOCK),
+    "one that walks": (walking(6), walking(7)[6], {}, np.roll(BLOCK, -2, axis=1) & (COLUMNS > 27)),
+    "one that has stood all the time": ([HERE] * NUM_LOOKS, HERE, {}, NOTHING),
+    "one that has stood for longer": ([WALL] * 4 + [HERE] * 8, HERE, {}, NOTHING),
+    "one that was told from the first on": (
+        [WALL] * 4 + [HERE] * 8,
+        HERE,
+        {"masks": [NOTHING] * 4 + [BLOCK] * 8},
+        BLOCK,
+    ),
+    "and has stood for all looks": ([HERE] * NUM_LOOKS, HERE, {"masks": [BLOCK] * NUM_LOOKS}, NOTHING),
+    "one that is gone": ([HERE] * 5, WALL, {}, NOTHING),
+    "a wrong prediction: a line": ([WALL] * 5, with_block(where=COLUMNS == 30), {}, NOTHING),
+    "a wrong prediction: pixels": ([WALL] * 5, with_block(where=(COLUMNS % 4 + ROWS % 4) == 0), {}, NOTHING),
+    "nearer by what depths err": ([WALL] * 5, with_block(2.9), {}, NOTHING),
+    "a pose that is not known": ([WALL] * 5, HERE, {"std": 0.5}, NOTHING),
+    "a noise that is not known": ([WALL] * 5, HERE, {"noise": 0.0}, NOTHING),
+    "one look only": ([WALL], HERE, {}, NOTHING),
+    "no look": ([], HERE, {}, NOTHING),
+    "what fills the view": ([WALL] * 5, np.full((48, 64), 1.0), {}, ~NOTHING),
+    "a place that no look shows": ([np.where(BLOCK, 0.0, WALL)] * 5, HERE, {}, NOTHING),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_free_space_decides_what_moves(case, settings):
+    views, now, more, expected = CASES[case]
+    looks = after(views, settings, more.get("masks", ()))
+    if case == "a place that no look shows":
+        looks = eqx.tree_at(lambda k: k.depth, looks, np.where(np.asarray(looks.depth) < 0.5, 0.0, looks.depth))
+    said = found(looks, now, settings, **{key: value for key, value in more.items() if key != "masks"})
+    kernel = np.lib.stride_tricks.sliding_window_view(np.pad(expected, 2, mode="edge"), (5, 5))
+    is_sure = kernel.all((2, 3)) | ~kernel.any((2, 3))  # the outline may be either
+    np.testing.assert_array_equal(said[is_sure], expected[is_sure])
+
+
+def test_a_camera_that_turns_and_a_map_that_moves_change_nothing_and_an_untracked_frame_is_no_look(settings):
+    """Looks are kept relative to the last camera: in another world the same poses give the same."""
+    poses = [pose([0.0, 0.02 * step, 0.0], [0.05 * step, 0.0, 0.0]) for step in range(6)]
+    world = pose([0.4, -1.0, 0.2], [3.0, -2.0, 1.0])
+
+    def wall_from(T, block):  # the plane z = 3 of the world, and a block at z = 2
+        rays = np.stack([(COLUMNS - 31.5) / 40, (ROWS - 23.5) / 44, np.ones((48, 64))], axis=-1)
+        R, t = np.asarray(T.rotation().as_matrix(), float), np.asarray(T.translation(), float)
+        direction = rays @ R.T
+        depths = [(z - t[2]) / direction[..., 2] for z in (3.0, 2.0)]
+        at = t + depths[1][..., None] * direction
+        return np.where(block & (abs(at[..., :2] - [0.1, 0.0]) < 0.4).all(-1), *depths[::-1])
+
+    views = [wall_from(T, block=False) for T in poses[:-1]]
+    now = wall_from(poses[-1], block=True)
+    said = found(
+        after(views, settings, (), poses[:-1]), now, settings, T_previous_camera=poses[-2].inverse() @ poses[-1]
+    )
+    is_block = now < 2.5
+    assert said[is_block].mean() > 0.8 and said[~is_block].mean() < 0.02
+    elsewhere = after(views, settings, (), [world @ T for T in poses[:-1]])
+    again = found(elsewhere, now, settings, T_previous_camera=poses[-2].inverse() @ poses[-1])
+    assert (again != said).mean() < 0.01
+    looks = after([WALL] * 3, settings)
+    lost = replace(seen(HERE), valid=device(np.zeros(48 * 64, bool)))
+    skipped = looked(looks, lost, device(NOTHING.reshape(-1)), poses[3], pose(), CAMERA)
+    np.testing.assert_array_equal(skipped.depth, looks.depth)
+    np.testing.assert_allclose(skipped.T_previous_look.wxyz_xyz[0], poses[3].inverse().wxyz_xyz, atol=1e-6)
+
+
+def test_as_printed_nothing_is_looked_for(config):
+    assert no_looks(seen(WALL), config("slam/motion=paper").motion) is None
