@@ -172,8 +172,8 @@ def test_what_is_seen_through_is_not_confirmed_by_what_it_explains(settings):
     "depth, change", [(2.0, 0.0), (2.2, -0.35), (3.0, -3.0)], ids=["on it", "behind", "far behind"]
 )
 def test_what_is_gone_goes_within_a_few_looks(settings, depth, change):
-    map = map_of(discs([[0.0, 0.0, 2.0]]), existence=2.0)
-    after, _ = judged(map, 0, look(depth), HERE, CAMERA, NOISE, settings)
+    map, clear = map_of(discs([[0.0, 0.0, 2.0]]), existence=2.0), eqx.tree_at(lambda c: c.gone, settings, device(3.0))
+    after, _ = judged(map, 0, look(depth), HERE, CAMERA, NOISE, clear)
     assert after.existence[0] == pytest.approx(2.0 + change)
 
 
