@@ -289,9 +289,9 @@ def localize_coarse(
     )
 
 
-def _corrected(current: Observation, field: DepthField, is_tracked: Bool[Array, ""]) -> Observation:
+def _corrected(current: Observation, field: DepthField) -> Observation:
     """The points of a frame without its field of depth errors: x exp(-f)."""
-    factor = jnp.exp(-jnp.where(is_tracked, field_at(field, current.points), 0.0))
+    factor = jnp.exp(-field_at(field, current.points))
     return eqx.tree_at(lambda o: o.points, current, current.points * factor[:, None])
 
 
@@ -317,8 +317,6 @@ def localize_fine(
     known = root_information(coarse.estimate.covariance)
     start = CoarseStart(coarse.T_world_camera, known, coarse.depth_noise, coarse.estimate.is_given)
     fine, scale, info = icp(scaled, submap, start, config.icp, index)
-    nodes = jnp.where(coarse.has_field, info.field.nodes, 0.0)
-    info = eqx.tree_at(lambda i: i.field.nodes, info, nodes)
     step = (coarse.T_world_camera.inverse() @ fine).log()
     # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
     step_m, step_rad = (part @ safe_normalize(part) for part in (step[:3], step[3:]))
@@ -334,7 +332,9 @@ def localize_fine(
     is_tracked = ~jnp.any(failed)
     T = jaxlie.SE3(jnp.where(is_tracked, fine.wxyz_xyz, coarse.T_world_camera.wxyz_xyz))
     scale = coarse.scale * jnp.where(is_tracked, scale, 1.0)
-    aligned = transform(T, _corrected(current, info.field, is_tracked), scale)
+    nodes = jnp.where(is_tracked & coarse.has_field, info.field.nodes, 0.0)
+    info = eqx.tree_at(lambda i: i.field.nodes, info, nodes)
+    aligned = transform(T, _corrected(current, info.field), scale)
     aligned = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid & coarse.is_usable)
     bits = jnp.sum(failed * 2 ** jnp.arange(failed.shape[0]))
     estimate, by_map = correct_by_points(coarse.estimate, info, coarse.depth_noise, scale, is_tracked, config.num_alike)

@@ -374,7 +374,7 @@ def _fuse(submap: Submap, frame: Frame, view: Camera, num_rows: int, config: Fus
     unexplained = eqx.tree_at(lambda o: o.valid, moved, trusted.valid & ~explained.is_fused)
     # The frame was moved onto the map, the mean of W frames: 1 / (W + 1) of what they differ is the map's own error.
     weight = median(explained_by.weight, explained.is_fused)
-    share = jnp.where(frame.localization.is_tracked & (info.num_fused > 0), 1.0 / (weight + 1.0), 0.0)
+    share = jnp.where(info.num_fused > 0, 1.0 / (weight + 1.0), 0.0)
     # All of the image alike, fused or not, so that no surface tears.
     places = lambda s: (s[0].gaussians.means, s[1].gaussians.means, s[2].points)  # noqa: E731
     surface = map, halves, unexplained
