@@ -119,12 +119,6 @@ def test_what_was_left_out_of_the_map_is_no_part_of_it_when_it_is_loaded_either(
     assert {node.submap for node in before.nodes} == {0}
 
 
-def test_a_map_with_depths_on_another_grid_is_refused_before_a_frame_is_mapped(folder):
-    coarse = load_config("graph=default", "graph.place_recognition.grid=[40,30]").graph
-    with pytest.raises(ValueError, match=r"was made with graph.place_recognition.grid=\[8,6\]: give that here, too"):
-        load(folder, coarse)
-
-
 def test_a_map_that_was_made_again_is_another_one(folder, graph):
     first = load(folder, graph).checksum
     assert load(folder, graph).checksum == first
@@ -158,28 +152,3 @@ def test_a_file_that_cannot_be_used_is_named_with_the_reason(graph, folder, chan
     with pytest.raises(ValueError, match=message) as error:
         load(folder, graph)
     assert "places.npz" in str(error.value) and "map again with graph=default" in str(error.value)
-
-
-def test_a_damaged_file_is_refused(graph, folder):
-    content = (folder / "places.npz").read_bytes()
-    (folder / "places.npz").write_bytes(content[: len(content) // 2])
-    with pytest.raises(ValueError, match="map again"):
-        load(folder, graph)
-
-
-def test_a_folder_that_is_no_finished_run_is_refused(graph, folder, end, tmp_path):
-    with pytest.raises(ValueError, match="add graph=default"):
-        load(folder, None)
-    with pytest.raises(ValueError, match="map_mode must be one of extend, localize"):
-        load(folder, graph, "track")
-    with pytest.raises(ValueError, match="is no folder"):
-        load(folder / "nowhere", graph)
-    save_map(folder / "map.npz", map_born(len(end.poses)))
-    with pytest.raises(ValueError, match="are not of one run"):
-        load(folder, graph)
-    (folder / "places.npz").unlink()
-    with pytest.raises(ValueError, match=r"has no places.npz: map it again with graph=default"):
-        load(folder, graph)
-    (folder / "metrics.json").unlink()
-    with pytest.raises(ValueError, match=r"not finished: the same command with hydra.run.dir="):
-        load(folder, graph)
