@@ -40,19 +40,11 @@ def strip(run: RecordedRun, errors: dict[str, np.ndarray]) -> list[Row]:
     ends = [f"{run.frames[0]['index']} – {run.frames[-1]['index']}"] if run.frames else []
     rows = [Row("frames", "", 20, ends, _statuses(run))]
     if errors:
-<<<<<<< HEAD
-        curves = {name: 100 * errors[name] for name in ERRORS if name in errors}
-        rows.append(_curves("error of the position", "cm", curves, 64))
-    names = "inliers", "residual", "scale", "moving", "new", "seconds", "compile_seconds"
-    inliers, residual, scale, moving, new, seconds, compiling = (_numbers(run, name) for name in names)
-=======
         factor, unit = (100, "cm") if has_metric_truth(run.provenance) else (1, "units")
         curves = {name: factor * errors[name] for name in ERRORS if name in errors}
         rows.append(_curves("error of the position", unit, curves, 64))
-    inliers, residual, scale, new, seconds, compiling = (
-        _numbers(run, name) for name in ("inliers", "residual", "scale", "new", "seconds", "compile_seconds")
-    )
->>>>>>> main
+    names = "inliers", "residual", "scale", "moving", "new", "seconds", "compile_seconds"
+    inliers, residual, scale, moving, new, seconds, compiling = (_numbers(run, name) for name in names)
     residual[inliers == 0] = np.nan  # of nothing
     moving = np.where((moving > 0).any(), moving, np.nan)
     for label, unit, values in (

@@ -9,12 +9,8 @@ from emgs_jax.mapping.records import APART
 from emgs_jax.report import columns
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
 from emgs_jax.report.html import Head, commit_words
-<<<<<<< HEAD
 from emgs_jax.report.moving import MUCH
-from emgs_jax.report.provenance import RAW_PRIOR
-=======
 from emgs_jax.report.provenance import RAW_PRIOR, in_unit, length_words, lines_of
->>>>>>> main
 from emgs_jax.report.recorded_run import POLISH, RecordedRun, sound
 from emgs_jax.report.repeat import Repeated
 
