@@ -116,7 +116,7 @@ def find_movers(
         T_previous_camera: from this camera to that of the last frame.
         estimate: of this pose, with the noise ν of depths; where that is 0 it is not known, and nothing moves.
     """
-    gaps, is_seen, index = _gaps(looks, view.points, T_previous_camera, estimate, camera)
+    gaps, _, is_seen, index = _gaps(looks, view.points, T_previous_camera, estimate, camera)
     ratios = jnp.maximum(config.hit - 0.5 * gaps**2, jnp.where(gaps > 0, -config.miss, 0.0))
     is_marked = jnp.take_along_axis(looks.moving, index, axis=1)
     ratios = jnp.where(is_seen, jnp.where(is_marked, jnp.minimum(ratios, 0.0), ratios), 0.0)
@@ -138,35 +138,37 @@ def shown_lately(
     camera: Camera,
     config: MotionConfig,
 ) -> Bool[Array, "n"]:
-    """Which points are surface in one of the latest looks, as `find_movers` compares them.
+    """Which points are surface in one of the latest looks, and not at its edge, where depths are wrong most often.
 
     Args:
         T_previous_points: from their frame to the camera of the last frame.
         estimate: of that camera's pose, with the noise of depths.
     """
     latest = jax.tree.map(lambda leaf: leaf[: config.num_latest], looks)
-    gaps, is_seen, _ = _gaps(latest, points, T_previous_points, estimate, camera)
-    return jnp.any(is_seen & (0.5 * gaps**2 < config.hit), axis=0)
+    _, widest, is_seen, _ = _gaps(latest, points, T_previous_points, estimate, camera)
+    return jnp.any(is_seen & (0.5 * widest**2 < config.hit), axis=0)
 
 
 def _gaps(
     looks: Looks, points: Float[Array, "n 3"], T_previous_points: jaxlie.SE3, estimate: PoseEstimate, camera: Camera
-) -> tuple[Float[Array, "k n"], Bool[Array, "k n"], Int[Array, "k n"]]:
+) -> tuple[Float[Array, "k n"], Float[Array, "k n"], Bool[Array, "k n"], Int[Array, "k n"]]:
     """How far before the depths of each look points are, in standard deviations; negative behind them, 0 among them.
 
     Returns:
-        The gaps, whether the look shows anything there, and in which of its rows.
+        The gaps, how far the depth is that differs most, whether the look shows anything there, and in which row.
     """
     pose_variance = jnp.diagonal(estimate.covariance)
     shift, turn = jnp.mean(pose_variance[:3]), jnp.mean(pose_variance[3:6])
 
-    def gap(look: tuple[Float[Array, "2 p"], Float[Array, "7"]]) -> tuple[Array, Array, Array]:
+    def gap(look: tuple[Float[Array, "2 p"], Float[Array, "7"]]) -> tuple[Array, Array, Array, Array]:
         (nearest, farthest), T_previous_look = look[0], jaxlie.SE3(look[1])
         pixels, z = project(camera, (T_previous_look.inverse() @ T_previous_points) @ points)
         index, inside = nearest_pixel(pixels, (camera.height, camera.width))
-        std = jnp.sqrt(2.0 * (estimate.depth_noise * z) ** 2 + shift + turn * z**2)
-        apart = jnp.maximum(nearest[index] - z, 0.0) - jnp.maximum(z - farthest[index], 0.0)
-        return apart / jnp.maximum(std, NEAREST_DEPTH), inside & (z > NEAREST_DEPTH) & (nearest[index] > 0), index
+        std = jnp.maximum(jnp.sqrt(2.0 * (estimate.depth_noise * z) ** 2 + shift + turn * z**2), NEAREST_DEPTH)
+        before, behind = (nearest[index] - z) / std, (z - farthest[index]) / std
+        is_seen = inside & (z > NEAREST_DEPTH) & (nearest[index] > 0)
+        widest = jnp.maximum(jnp.abs(before), jnp.abs(behind))
+        return jnp.maximum(before, 0.0) - jnp.maximum(behind, 0.0), widest, is_seen, index
 
     return jax.vmap(gap)((looks.depth, looks.T_previous_look.wxyz_xyz))
 
