@@ -73,7 +73,8 @@ def rewritten(folder, **changes):
 def test_what_is_read_is_what_was_written(end, graph, folder):
     read, depth_noise = load_places(folder / "places.npz", BackEnd(graph, CAMERA, 0.01))
     assert depth_noise == 0.01
-    _same([replace(node, online=None) for node in read.nodes], [replace(node, online=None) for node in end.nodes])
+    unsaved = {"online": None, "origin": None}
+    _same(*([replace(node, **unsaved) for node in one.nodes] for one in (read, end)))
     for name in ("factors", "verified", "violating", "accepted"):
         _same(getattr(read, name), getattr(end, name))
     assert (read.first_node, read.connected_since) == (len(end.poses), len(end.poses))
@@ -107,10 +108,10 @@ def test_what_was_left_out_of_the_map_is_no_part_of_it_when_it_is_loaded_either(
     parted = walked(graph, ring())
     database = add_keyframe(Database(), end.database.keyframes[1], graph.place_recognition)
     nodes = [replace(node, submap=0 if row < 3 else 4) for row, node in enumerate(parted.nodes)]
-    parted = replace(parted, nodes=nodes, submap_id=4, database=database)
+    parted = replace(parted, nodes=nodes, active=4, database=database)
     save_places(tmp_path / "places.npz", parted, 0.0)
     read, _ = load_places(tmp_path / "places.npz", BackEnd(graph, CAMERA, 0.01))
-    np.testing.assert_array_equal(nodes_of(read, read.submap_id).valid, nodes_of(parted, parted.submap_id).valid)
+    np.testing.assert_array_equal(nodes_of(read, read.active).valid, nodes_of(parted, parted.active).valid)
     with np.load(tmp_path / "places.npz") as file:
         arrays = {name: array for name, array in file.items() if name != "is_kept"}  # as of a version before
     np.savez(tmp_path / "places.npz", **arrays)
