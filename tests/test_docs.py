@@ -11,6 +11,8 @@ import pytest
 from omegaconf import OmegaConf
 from scene import CONF, compose
 
+import emgs_jax
+
 ROOT = CONF.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "sweep", "tune", "protocol")
@@ -90,7 +92,7 @@ def test_instructions_are_short_and_have_no_history():
         assert not re.search(r"`(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,12}`", text), page
 
 
-def test_the_site_builds_without_a_warning_and_has_every_key(tmp_path):
+def test_the_site_builds_without_a_warning_and_has_every_key_and_name(tmp_path):
     """As `mkdocs build --strict` does: every link and anchor is there, and so is every page of the navigation."""
     pytest.importorskip("mkdocs")
     words = ["build", "--strict", "--quiet", "--config-file", str(ROOT / "mkdocs.yml"), "--site-dir", str(tmp_path)]
@@ -98,3 +100,5 @@ def test_the_site_builds_without_a_warning_and_has_every_key(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     keys = (tmp_path / "keys.html").read_text()
     assert all(str(path.relative_to(CONF)) in keys for path in CONF.rglob("*.yaml"))
+    names = (tmp_path / "names.html").read_text()
+    assert all(f'id="{name.lower()}"' in names for name in emgs_jax.__all__ if name != "__version__")

@@ -113,7 +113,7 @@ def track(run: MappingRun, window: WindowInput) -> MappingRun:
 
 def start_map(run: MappingRun, first: FirstWindow) -> MappingRun:
     """Prepare the step for the first window, and start the map of a run that continues in none."""
-    prepare_step(first, run.camera, run.config)
+    prepare_step(first.views, run.camera, run.config)
     if run.saved is not None:
         return run
     state, config = start(first, run.camera, run.config)
