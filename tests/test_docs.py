@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import shlex
 import subprocess
 import sys
 from functools import cache
@@ -12,6 +13,8 @@ from omegaconf import OmegaConf
 from scene import CONF, compose
 
 import emgs_jax
+from emgs_jax.config.overrides import readable
+from experiments.command import check_arguments
 
 ROOT = CONF.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -54,6 +57,24 @@ def test_commands_options_and_files_are_there(page):
     for name in re.findall(r"^((?:emgs_jax|conf|tests|docs|notebooks|experiments)/[\w./]+)$", code(page), re.MULTILINE):
         assert (ROOT / name).exists(), name
     assert not re.search(r"=-?\.(inf|nan)", code(page))
+
+
+def commands(page: Path) -> set[tuple[str, ...]]:
+    """Name of each command of a page and its overrides, without those that are left to the reader ("…")."""
+    found = set()
+    for part in re.split(r"&&|\n", code(page).replace("\\\n", " ")):
+        part = part.replace("python -m experiments.", "emgs ")
+        if re.match(r"\s*emgs [a-z]", part) and "$PWD" not in part:
+            _, name, *words = shlex.split(part, comments=True)
+            found.add((name, *(word for word in words if "=" in word and "…" not in word)))
+    return found
+
+
+@pages
+def test_every_command_composes_its_config(page):
+    """Keys, options and their values: those of what is named here, `mine/` aside, which test_extending.py runs."""
+    for name, *words in commands(page):
+        check_arguments("config" if name == "run" else name, readable(words))
 
 
 @pages

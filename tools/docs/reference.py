@@ -58,7 +58,8 @@ def outline(node: ast.FunctionDef | ast.ClassDef) -> ast.stmt:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages to the site as `keys.md` and `names.md`."""
-    for name, page in (("keys.md", keys()), ("names.md", names())):
+    """Add the pages to the site as `keys.md` and `names.md`, and CHANGELOG.md as `changes.md`."""
+    changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
+    for name, page in (("keys.md", keys()), ("names.md", names()), ("changes.md", changes)):
         files.append(File.generated(config, name, content=page))
     return files
