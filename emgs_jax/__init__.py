@@ -46,7 +46,8 @@ if TYPE_CHECKING:  # for editors and type checkers, and the list of names
     from emgs_jax.mapping.capacity import advance, start
     from emgs_jax.mapping.convert import FirstWindow, opening, to_camera, to_first_window, to_prediction
     from emgs_jax.mapping.finalize import in_prior_unit
-    from emgs_jax.mapping.pipeline import finish_run, integrate, map_frames
+    from emgs_jax.mapping.integrate import integrate
+    from emgs_jax.mapping.pipeline import finish_run, map_frames
     from emgs_jax.mapping.records import FrameRecord
     from emgs_jax.mapping.run import MappingRun, new_run
     from emgs_jax.mapping.window_input import WindowInput, window_inputs

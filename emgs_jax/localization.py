@@ -71,7 +71,8 @@ class LocalizationConfig(eqx.Module):
         num_shared: frames whose windows share images: so many differences of repeats count, see `repeat_poses`, and the
             first frame is half as many motions from the middle of its window, see `own_covariance`.
         min_inlier_fraction: of the points, below which the fine pose is not accepted.
-        max_residual: root mean square distance to the map's planes, as a fraction of the depth.
+        max_residual: root mean square distance to the map's planes, as a fraction of the depth; not asked of a pose
+            that is surely known without the points, see `CoarsePose.is_placed`.
         max_step: between the coarse and the fine pose, as a fraction of the mean depth.
         max_step_rad: likewise, rad.
         max_pose_std: standard deviation of the pose in its least certain direction, by what is known before and by the
@@ -107,6 +108,8 @@ class CoarsePose(eqx.Module):
         is_usable: False where the prediction has no valid point or pose.
         has_field: False where depths are triangulated with the poses, as the prior says by a scale that is certain:
             then their errors are of pixels, and what looks like a field is the map's.
+        is_placed: True where the prior has the pose from elsewhere than these depths, and knows it better than they
+            tell: how much they differ from the map is then their own error, and no reason to doubt the pose.
     """
 
     T_world_camera: jaxlie.SE3
@@ -119,6 +122,7 @@ class CoarsePose(eqx.Module):
     is_known: Bool[Array, ""]
     is_usable: Bool[Array, ""]
     has_field: Bool[Array, ""]
+    is_placed: Bool[Array, ""]
 
 
 class LocalizationInfo(eqx.Module):
@@ -285,7 +289,17 @@ def localize_coarse(
     is_usable = is_finite & (jnp.sum(prediction.current.valid) >= MIN_PAIRS)
     has_field = ~(is_sure & (prediction.scale_std == 0))
     return CoarsePose(
-        coarse, newest, scale, repeat_rms, mean_depth, depth_noise, estimate, is_finite, is_usable, has_field
+        coarse,
+        newest,
+        scale,
+        repeat_rms,
+        mean_depth,
+        depth_noise,
+        estimate,
+        is_finite,
+        is_usable,
+        has_field,
+        is_placed=is_firm & has_field,
     )
 
 
@@ -324,7 +338,7 @@ def localize_fine(
         [
             ~coarse.is_usable,
             ~(info.inlier_fraction >= config.min_inlier_fraction),
-            ~(info.residual <= config.max_residual),
+            ~((info.residual <= config.max_residual) | coarse.is_placed),
             ~((step_m <= config.max_step * coarse.mean_depth) & (step_rad <= config.max_step_rad)),
             ~(info.min_eigenvalue >= config.max_pose_std**-2),
         ]

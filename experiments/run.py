@@ -120,7 +120,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     with clock.phase("report"):
         recorded = read_run(folder)
     if fitting is not None:
-        with _said(clock, "polish", "fitting splats to the images"):
+        tqdm.write("fitting splats to the images …")
+        with clock.phase("polish"):
             notes = [*notes, *polish_lines(polish(recorded, dataset, fitting, densify))]
     with _said(clock, "report", f"writing {REPORT_FILE}"):
         write_report(recorded, dataset)

@@ -1,5 +1,6 @@
 """A run that is made by hand: a map whose content is known, frames of every status, poses that all differ."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import hydra
@@ -8,10 +9,13 @@ import numpy as np
 from scene import compose
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.back_end.state import BackEnd, Node
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.geometry import Sim3
-from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.mapping.atlas import Atlas, Submap
+from emgs_jax.mapping.records import IN_MAP, FrameRecord
+from emgs_jax.mapping.run import MappingRun
 from emgs_jax.ops.camera import Camera
 
 STATUSES = ("initialization", "tracked", "degraded", "lost", "tracked", "tracked")
@@ -88,3 +92,23 @@ def hand_run(poses, raw_poses, true_poses, statuses=STATUSES, gaussians=None) ->
 def densify_config(*overrides: str):
     """How the wall becomes points."""
     return hydra.utils.instantiate(compose("render.tile_size=8", "render.tile_capacity=256", *overrides).densify)
+
+
+def atlas_of(records, state=None, config=None, graph=None, **fields) -> Atlas:
+    """An atlas whose nodes are the frames of these records, in `graph` where one is given."""
+
+    def node(record: FrameRecord) -> Node:
+        is_tracked = record.status == "tracked"
+        known = {"covariance": record.covariance, "origin": record.origin}
+        known["depth_noise"] = record.depth_noise if is_tracked else None
+        scale = np.log(record.scale or 1.0)
+        return Node(record.pose, record.pose, scale, record.index, is_placed=record.status in IN_MAP, **known)
+
+    graph = BackEnd(None, (1.0, 1.0, 0.0, 0.0), 0.0) if graph is None else graph
+    submaps = {} if state is None else {0: Submap(state)}
+    return Atlas(None, config, replace(graph, nodes=tuple(map(node, records))), submaps, **fields)
+
+
+def run_of(records, *parts, **fields) -> MappingRun:
+    """A run with these records, see `atlas_of`."""
+    return MappingRun(atlas_of(records, *parts, **fields), records=tuple(records))

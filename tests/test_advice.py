@@ -1,133 +1,66 @@
-"""Advice helps: the cause of a message is made, the message read and what it says done, after which the same works.
-
-A row is a cause, the message, and remedies, each of which is tried by itself on files that are sound but for the cause.
-"""
+"""Advice of data sets and predictions, see `advice`."""
 
 import json
-import re
 import shutil
 import subprocess
-from collections.abc import Callable, Mapping
-from functools import cache
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
 import pytest
 import tiny_run
-import yaml
-from omegaconf import OmegaConf
+from hydra.errors import InstantiationException
 from PIL import ExifTags, Image
 
-from emgs_jax.config.configure import compose
+from emgs_jax.config.configure import build, compose, message_of
+from emgs_jax.data.bonn import Bonn
 from emgs_jax.data.calibration_files import read_calibration
 from emgs_jax.data.checksums import SUMS_FILE, WRITE
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.data.euroc import Euroc
 from emgs_jax.data.images import Images
 from emgs_jax.data.kitti import Kitti
+from emgs_jax.data.masks import Masks
 from emgs_jax.data.posed_images import Colmap, Nerfstudio
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.replica import Replica
+from emgs_jax.data.rosbag import RosBag
 from emgs_jax.data.seven_scenes import SevenScenes
 from emgs_jax.data.tum import Tum
-from emgs_jax.io.files import jsonable
-from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.files.prior import Files
-from emgs_jax.report.provenance import RESULT_FORMAT
-from emgs_jax.report.results import METRICS_FILE, is_finished
-from experiments.evaluate import plan
-from experiments.export import export_run
-from experiments.grid import read_axes, variants
-from experiments.query import query
-from experiments.score import score
-from experiments.search import read_objectives, read_space
+from emgs_jax.prior.multiview.depth_files import way_of_files
+from emgs_jax.prior.network.framework import DINOV2_CLONE, check_checkpoint
+from emgs_jax.prior.recorded import Recorded, record
+from emgs_jax.prior.simulated.prior import Simulated
+from emgs_jax.structure.library import member, options_of
+from emgs_jax.structure.reconstruct import Shots, matcher_of
+from emgs_jax.structure.store import given_models
+from tests.advice import (
+    LEFT_OUT,
+    Said,
+    Step,
+    check_helps,
+    each_remedy,
+    edit,
+    fetched,
+    gone,
+    lines,
+    moved,
+    put,
+    resized,
+    sound_files,
+)
 from tests.data.test_calibration_files import CORNER, KALIBR, MAST3R, ORB, ROS, TRANSFORMS
 from tests.data.test_calibration_files import PLAIN as OF_VIPE
 from tests.data.written_benchmarks import CAMERAS, EUROC_SIZE, write_colmap, write_euroc, write_kitti, write_nerfstudio
 from tests.data.written_scene import color_image, write_replica, write_seven_scenes, write_tum
 from tests.prior.files.written_predictions import KEYS, NAMES, Named, truth, write_depths, write_npz
-from tests.report.written_run import written_run
-from tests.scripts.test_score import SIMILARITY, room, write_system
-
-Said = re.Match | None
-Step = Mapping[str, Any] | tuple | Callable[[Path, Said], Any]
-
-
-def done(step: Step, root: Path, said: Said = None) -> dict[str, Any]:
-    """Options of the reader after a step: those it is, those of its parts, or none of a function that changes files.
-
-    A text may name `{root}`, and by its number a part of what the message said.
-    """
-    if isinstance(step, tuple):
-        return {key: value for part in step for key, value in done(part, root, said).items()}
-    if callable(step):
-        step(root, said)
-        return {}
-    words = () if said is None else (said[0], *said.groups())
-    filled = {key: value.format(*words, root=root) for key, value in step.items() if isinstance(value, str)}
-    return {**step, **{key: yaml.safe_load(value) for key, value in filled.items()}}
-
-
-def edit(file: str, *pairs: tuple[str, str]) -> Step:
-    """Replace parts of a text, each of which must be there."""
-
-    def run(root, said):
-        text = (root / file).read_text()
-        for old, new in pairs:
-            assert old in text, f"{old} is not in {file}"
-            text = text.replace(old, new, 1)
-        (root / file).write_text(text)
-
-    return run
-
-
-def lines(file: str, change: Callable[[list[str]], list[str]]) -> Step:
-    """Change the words of each line that is no comment; without any it is gone."""
-
-    def run(root, said):
-        text = (root / file).read_text()
-        found = [line if line.startswith("#") else " ".join(change(line.split())) for line in text.splitlines() if line]
-        (root / file).write_text("\n".join(filter(None, found)) + "\n")
-
-    return run
-
-
-def put(file: str, content: str | bytes | np.ndarray) -> Step:
-    def run(root, said):
-        (root / file).parent.mkdir(parents=True, exist_ok=True)
-        data = cv2.imencode(Path(file).suffix, content)[1].tobytes() if isinstance(content, np.ndarray) else content
-        (root / file).write_bytes(data if isinstance(data, bytes) else data.encode())
-
-    return run
-
-
-def gone(file: str) -> Step:
-    return lambda root, said: (root / file).unlink()
-
-
-def moved(file: str, to: str) -> Step:
-    def run(root, said):
-        (root / to).parent.mkdir(parents=True, exist_ok=True)
-        (root / file).rename(root / to)
-
-    return run
-
-
-def fetched(file: str) -> Step:
-    """The file as it was."""
-    return lambda root, said: shutil.copy(root.parent / "sound" / file, root / file)
-
-
-def resized(file: str, size: tuple[int, int]) -> Step:
-    def run(root, said):
-        image = cv2.imread(str(root / file), cv2.IMREAD_UNCHANGED)
-        cv2.imwrite(str(root / file), cv2.resize(image, size, interpolation=cv2.INTER_NEAREST))
-
-    return run
+from tests.prior.network_double import Double, Sphere, network_of
 
 
 def frames(build: Callable, **defaults) -> Callable[..., int]:
@@ -177,7 +110,7 @@ OF_TUM = [
     ({"stride": 0}, r"must be at least (\d)", {"stride": "{1}"}),
     ({"start": 0.5}, "must be a whole number of images", {"start": 0}),
     ({"size": [320]}, r"must be \[width, height\] in pixels", {"size": [320, 240]}),
-    ({"depth_scale": 0}, r"raw units per metre \((\d+) for TUM\)", {"depth_scale": "{1}"}),
+    ({"depth_scale": 0}, "correct it, or leave the key out", {"depth_scale": 5000}, {"depth_scale": LEFT_OUT}),
     ({"intrinsics": [1070.8, 1078.4, 640.7, 495.7]}, "at the size of the images on disk", {"intrinsics": FR3}),
     ({"intrinsics": [500, 0, 320, 240]}, "must be .fx, fy, cx, cy.", {"intrinsics": FR3}),
     (
@@ -258,7 +191,7 @@ OF_TUM = [
     ((LABELS, put(LABEL, np.uint8(WALL + 40))), "write it with 16 bits", put(LABEL, WALL + 296)),
     (
         (LABELS, put(LABEL, WALL + 3)),
-        "give the class file of this data set, or say with `unknown` which ids mean no class",
+        r"give the class file of this data set, or say with dataset\.(unknown)=",
         *({"unknown": [0, 7]}, put(CLASSES, "4 wall\n7 cup\n")),
     ),
     ((LABELS, {"unknown": "7"}), "must be a list of ids, whole numbers from 0", {"unknown": [0]}),
@@ -671,7 +604,7 @@ OF_PREDICTIONS = [
     ((own(".npy"), put("own/poses.json", "[]")), 'must hold {"T_world_camera": {"name of the file', named_poses()),
     ({"scale": "relative"}, "must be one of auto, (metric), arbitrary", {"scale": "{1}"}),
     ({"scale": "arbitrary", "median_depth": 0.0}, "must be above 0 m", {"median_depth": 2.0}),
-    ({"depth_scale": 0.0}, "must be raw units per metre .(5000) for TUM", {"depth_scale": "{1}"}),
+    ({"depth_scale": 0.0}, "must be raw units per metre, above 0", {"depth_scale": 1000.0}),
 ]
 
 
@@ -783,252 +716,355 @@ OF_CLASSES = [
     ),
     ({"file": "a.txt"}, "class file .*a.txt does not exist: give a name a line", put("a.txt", "wall\n")),
 ]
-PATH, PLY, OUT = "path.txt", "cloud.ply", "out"
-
-
-def write_peer(root: Path) -> None:
-    """Another system's path and cloud of the tiny room."""
-    write_system(root, *room())
-
-
-def path_with(change: Callable[[np.ndarray, np.ndarray], tuple]) -> Step:
-    return lambda root, said: save_trajectory_tum(root / PATH, *change(*room()[:2]))
-
-
-def read_score(root: Path, **keys) -> float:
-    words = [f"trajectory={root / PATH}", f"points={root / PLY}", "method=peer", f"out={root / OUT}"]
-    return score(tiny_run.compose(*words, *(f"{key}={value}" for key, value in keys.items()), name="score"))[0]
-
-
-def cloud_of(points: np.ndarray) -> Step:
-    return lambda root, said: save_points_ply(root / PLY, points, 0 * points, 0 * points)
-
-
-SPREAD = np.random.default_rng(0).normal(size=(99, 3))
-FAR = np.concatenate([SPREAD, [[1e9, 0, 0]]])
-TEXT_PLY = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
-CORNERS = "0 0 0\n1 0 0\n0 1 0\n"
-SE3 = {"evaluation.alignment": "se3"}
-OF_SCORE = [
-    (
-        path_with(lambda times, poses: (2 * times, poses)),
-        r"3 of 6 poses.*: write the data set's timestamps .* or accept fewer \(min_associated_percent\)",
-        *(fetched(PATH), {"min_associated_percent": 50}),
-    ),
-    (
-        path_with(lambda times, poses: (times + 0.05, poses)),
-        "no pose is within .*, choose the same frames .*, raise max_time_difference",
-        {"max_time_difference": 0.06},
-    ),
-    (
-        (path_with(lambda times, poses: (times[3:], poses[3:])), {"dataset.stop": 3}),
-        r"choose the same frames \(dataset.start, stop, stride\)",
-        {"dataset.stop": 6},
-    ),
-    (
-        path_with(lambda times, poses: (times, np.linalg.inv(poses))),
-        "where the poses are taken as world -> camera: expected are",
-        fetched(PATH),
-    ),
-    (
-        path_with(lambda times, poses: ([*times, *times], [*poses, *SIMILARITY.apply_to_poses(poses)])),
-        "keep one path, with all digits of its times",
-        *(fetched(PATH), path_with(lambda times, poses: ([*times, *times + 0.001], [*poses, *poses]))),
-    ),
-    (gone(PATH), "path.txt is no file: give a file with `timestamp tx ty tz qx qy qz qw`", fetched(PATH)),
-    (put(PATH, "1 2 3\n"), "path.txt:1: expected `timestamp tx ty tz qx qy qz qw`", fetched(PATH)),
-    (gone(PLY), "cloud.ply is no file: give a PLY file", fetched(PLY)),
-    (put(PLY, "# nothing\n"), "cloud.ply is no PLY file .*: give a PLY file", fetched(PLY)),
-    (cloud_of(SPREAD[:0]), "cloud.ply has no points: write the points of the map as PLY", cloud_of(SPREAD)),
-    (cloud_of(FAR), "give the points in metres, and without stray ones", cloud_of(SPREAD)),
-    (
-        put(PLY, f"{TEXT_PLY}{CORNERS}nan 0 0\n"),
-        "1 of 4 points are not finite .*: leave them out of the file",
-        put(PLY, f"{TEXT_PLY.replace('4', '3', 1)}{CORNERS}"),
-    ),
-    (
-        (lambda root, said: read_score(root), SE3),
-        r"method=NAME of emgs score\), choose another out=FOLDER or move the folder away",
-        *({"method": "other"}, {"out": "{root}/elsewhere"}, moved(OUT, "away")),
-    ),
-    ({"method": "a/b"}, "must be a name that is one folder below .*: choose another", {"method": "ab"}),
-    ({"min_matched_percent": "many"}, "a number from 0 to (100).*: give such a value", {"min_matched_percent": "{1}"}),
+OF_BONN = [
+    ({"root": None}, "give dataset.root=FOLDER .*Bonn RGB-D Dynamic", {"root": "{root}"}),
+    ({"sequence": "rgbd_bonn_balloon"}, r"has: (\w+)$", {"sequence": "{1}"}),
+    ({"depth_scale": -1}, "leave the key out for the data set's own", {"depth_scale": LEFT_OUT}),
+    ({"intrinsics": "estimate"}, "build the data set from a config", {"intrinsics": LEFT_OUT}),
+    (shifted(time=0.5), "raise dataset.max_time_difference", {"max_time_difference": 0.6}),
+    (edit(TRUTH, ("100.9950 0.04", "100.9950 x")), "groundtruth.txt, line 3: .* set on_bad_frame=skip", SKIP),
 ]
 
-
-def read_plan(root: Path, *words: str, **keys) -> int:
-    """Jobs of an evaluation of which one has a result, of other settings where the words say so."""
-    given = [f"out={root / OUT}", *words, *(f"{key}={value}" for key, value in keys.items())]
-    settings = OmegaConf.to_container(compose("suite=smoke", *given, name="evaluate"), resolve=True)
-    return len([is_finished(job.folder, OmegaConf.to_container(job.config, resolve=True)) for job in plan(settings)])
+BAG_CAMERA = [130, 128, 80.5, 59]
 
 
-def write_finished(root: Path) -> None:
-    settings = OmegaConf.to_container(compose("suite=smoke", f"out={root / OUT}", name="evaluate"), resolve=True)
-    for job in plan(settings):
-        config = OmegaConf.to_container(job.config, resolve=True)
-        content = {"provenance": {"format": RESULT_FORMAT, "config": jsonable(config)}}
-        put(str((job.folder / METRICS_FILE).relative_to(root)), json.dumps(content))(root, None)
+def bag(**options) -> Step:
+    """Another bag in the place of the one that is there, see `write_bag`."""
+
+    def run(root, said):
+        shutil.rmtree(root / "walk", ignore_errors=True)
+        pytest.importorskip("rosbags", reason="reads bags: pip install -e .[rosbag]")
+        from tests.data.written_bag import write_bag
+
+        write_bag(root, **options)
+
+    return run
 
 
-OTHER = {"overrides": "'[slam.em.noise=0.3]'"}
-OF_EVALUATION = [
+RECTIFIED = {"topic": "/cam/image_rect"}
+OF_ROSBAG = [
+    ({"root": None}, "give dataset.root=FOLDER", {"root": "{root}"}),
+    ({"sequence": "run"}, r"has: (\w+)$", {"sequence": "{1}"}),
     (
-        OTHER,
-        r"\(\+variants.NAME=\{KEY:VALUE\} of emgs evaluate, .*, choose another out=FOLDER or move the folder away",
-        {"overrides": "'[]'", "+variants.other": "'{{slam.em.noise:0.3}}'"},
-        *({"out": "{root}/elsewhere"}, moved(OUT, "away")),
+        (put("notes/a.txt", ""), {"sequence": "notes"}),
+        "no bag that can be read .* or the folder of a ROS 2 bag with metadata.yaml",
+        {"sequence": "walk"},
     ),
-    ({"overrides": "'[prior.seed=3]'"}, r"give (seeds)=\[…\]", {"overrides": "'[]'", "seeds": "'[3]'"}),
-    ({"overrides": "'[dataset=tum]'"}, "give suite=NAME", {"overrides": "'[]'", "suite": "smoke"}),
+    ({"topic": "/eye"}, r"give dataset.(\w+)= one of (\S+)$", {"topic": "{2}"}),
+    ({"info_topic": "/eye"}, r"give dataset.(info_topic)= one of (\S+)$", {"info_topic": "{2}"}),
     (
-        {"overrides": "'[prior=multiview_stereo]'", "seeds": "'[0,1]'"},
-        r"give one seed, seeds=(\[0\])",
-        {"seeds": "'{1}'", "out": "{root}/elsewhere"},
+        bag(others=[{"name": "left"}]),
+        r"has several of sensor_msgs/Image: give dataset.topic= one of (\S+), (\S+)$",
+        *({"topic": "{1}"}, {"topic": "{2}"}),
+    ),
+    (bag(info=False), "no camera_info, so dataset.intrinsics must say the camera", {"intrinsics": BAG_CAMERA}),
+    (
+        (bag(encoding="bayer_rggb8", others=[{"name": "rect"}]), {"topic": "/cam/image_raw"}),
+        "'bayer_rggb8', .* choose another dataset.topic, such as the rectified one",
+        RECTIFIED,
+    ),
+    (
+        (bag(model="omni", bent=[0.1] * 4, others=[{"name": "rect"}]), {"topic": "/cam/image_raw"}),
+        r"\(a rectified topic needs none of its distortion\).* and give the new calibration",
+        *(RECTIFIED, {"intrinsics": BAG_CAMERA}),
+    ),
+    (
+        bag(name="rect", P=np.zeros(12)),
+        "no P for the rectified .*: give dataset.intrinsics",
+        {"intrinsics": BAG_CAMERA},
+    ),
+    (bag(num_cut=9), "is not as large as it says: record it again, or set on_bad_frame=skip", bag(), SKIP),
+    (bag(kind="CompressedImage", num_cut=99), "is damaged: record it again, or set on_bad_frame=skip", bag(), SKIP),
+]
+
+LEFT = np.uint8(255 * (np.indices(EUROC_SIZE[::-1])[1] >= 40))
+NAMED = {"names": "{root}/names.txt"}
+
+
+def write_masked(root: Path) -> None:
+    for i in range(3):
+        put(f"images/{i}.png", color_image(i, EUROC_SIZE))(root, None)
+        put(f"masks/{i}.png", LEFT)(root, None)
+    put("names.txt", "7 person\n255 cat\n")(root, None)
+
+
+def read_masked(root: Path, on_bad_frame: str = "error", **keys) -> float:
+    """The share of what is left out of the images that can be read."""
+    masks = Masks(**{"folder": str(root / "masks")} | keys)
+    found = ReadableFrames(Images(str(root / "images"), intrinsics=SQUARE, size=EUROC_SIZE), on_bad_frame, masks=masks)
+    return np.mean([frame.mask for frame in found])
+
+
+OF_MASKS = [
+    (
+        gone("masks/1.png"),
+        r"no mask for 1 .and 0 more.: give a folder with one image for each frame, (1\.png)",
+        fetched("masks/1.png"),
+    ),
+    ({"folder": "{root}/images/masks"}, "no mask for 0 .and 2 more", {"folder": "{root}/masks"}),
+    (resized("masks/1.png", (120, 160)), "it is turned: make it of that size", resized("masks/1.png", EUROC_SIZE)),
+    (resized("masks/1.png", (160, 160)), "but its image is 160x120: make it of", resized("masks/1.png", EUROC_SIZE)),
+    (put("masks/1.png", b"none"), "fetch the file again or set on_bad_frame=skip", fetched("masks/1.png"), SKIP),
+    ({"classes": ["cat"]}, "masks.names, the file that names the ids", NAMED),
+    (({"classes": ["dog"]}, NAMED), r"are no classes of .*, (\w+)$", {"classes": "['{1}']"}),
+    (
+        ({"classes": ["cat"]}, NAMED, put("names.txt", "7 person\n9 cat\n")),
+        "no name in .* for id 255: give the class file of this data set$",
+        fetched("names.txt"),
     ),
 ]
 
 
-def written_with_points(root: Path) -> None:
-    save_points_ply(written_run(root / "run") / "points.ply", SPREAD, SPREAD, np.clip(np.abs(SPREAD), 0, 1))
+def recorded(root: Path, name: str = "recording", seed: int = 5, stop: int = 6) -> None:
+    data = Named(names=NAMES[:stop])
+    record(Simulated(seed=seed, feature_size=4), data, tiny_run.WINDOW_SIZE, root / name)
 
 
-def read_export(root: Path, **keys) -> list[Path]:
-    given = {"formats": "[frustums]"} | keys
-    return export_run(
-        compose(f"folder={root / 'run'}", *(f"{key}={value}" for key, value in given.items()), name="export")
-    )
+def read_recorded(root: Path, folder: str = "recording", into: str | None = None, stop: int = 6, size: int = 3) -> int:
+    if into is not None:
+        recorded(root, into, seed=6)
+    prior, data = Recorded(root / folder), Named(names=NAMES[:stop])
+    prior.check(data, size)
+    calls = windows(len(data), size)
+    return len([prior.predict(call, [data[i] for i in call.views], data.intrinsics) for call in calls])
 
 
-FRUSTUMS = {"formats": "'[frustums]'"}
-OF_EXPORT = [
-    ({"formats": "'[obj]'"}, "formats=obj is not known: choose of (colmap), nerfstudio", {"formats": "'[{1}]'"}),
-    ({"formats": "'[]'"}, "writes nothing: give (colmap), nerfstudio or frustums", {"formats": "'[{1}]'"}),
+def again(root: Path, said: Said) -> None:
+    """`emgs predict` as before, which keeps what is whole."""
+    recorded(root)
+
+
+ELSEWHERE = (lambda root, said: recorded(root, "new"), {"folder": "new"})
+MANIFEST, INFERENCE = "recording/manifest.json", "recording/000001.npz"
+OF_RECORDED = [
+    ({"folder": "."}, "manifest.json is missing: expected the folder of a recording", {"folder": "recording"}),
+    (put(MANIFEST, "{"), "is damaged .*: record into another folder with .*experiments.predict", ELSEWHERE),
+    (put(MANIFEST, "[]"), "is not of the format .*: record into another folder", ELSEWHERE),
+    (edit(MANIFEST, ('"version": 3', '"version": 9')), "has version 9, .*: record into another folder", ELSEWHERE),
+    (edit(MANIFEST, ('"version": 3', '"version": 2')), "SHA-256 does not fit.: record into another", ELSEWHERE),
+    (put(INFERENCE, b"PK"), "000001.npz is damaged .*experiments.predict.* makes what is missing or damaged", again),
+    (gone(INFERENCE), "000001.npz is missing: .*experiments.predict.* makes what is missing or damaged", again),
+    ({"size": 4}, "window_size 3, but this run has 4: .* or record into another folder", {"size": 3}),
     (
-        (put("run/colmap/x", ""), {"formats": "'[colmap]'"}),
-        "colmap is there already: remove it, or write elsewhere with out=FOLDER",
-        *({"out": "{root}/there"}, (gone("run/colmap/x"), lambda root, said: (root / "run/colmap").rmdir())),
+        {"stop": 4},
+        "recorded with num_frames 6, but this run has 4: choose the recording of this sequence or record into another",
+        *({"stop": 6}, (lambda root, said: recorded(root, "new", stop=4), {"folder": "new"})),
     ),
-    ({"scale": 2, "length": "'[0,1,2]'"}, "both say how long things are: give one of them", {"scale": "'null'"}),
-    ({"length": "'[0,1]'"}, r"length must be \[frame,frame,metres\]", {"length": "'[0,1,2]'"}),
-    ({"length": "'[0,0,1]'"}, "at one place: take two that are far apart", {"length": "'[0,5,1]'"}),
-    ({"length": "'[0,3,1]'"}, r"frame 3 .*: take another one \(index in frames.jsonl\)", {"length": "'[0,4,1]'"}),
+    ({"into": "recording"}, "holds a recording with provenance .*: choose another folder", {"into": "new"}),
+]
+
+DENSE = np.float32(np.random.default_rng(0).uniform(0.1, 1.0, (6, 48, 64)))
+
+
+def write_dense(root: Path) -> None:
+    (root / "npy").mkdir()
+    for name, values in zip(NAMES, DENSE, strict=True):
+        np.save(root / "npy" / f"{name}.npy", values)
+
+
+def saved(name: str, **arrays: np.ndarray) -> Step:
+    return lambda root, said: np.savez(root / name, **arrays)
+
+
+def read_dense(root: Path, folder: str = "npy", names: list[str] = NAMES, **keys) -> bool:
+    keys = {"folder": root / folder, "kind": "affine_inverse", "depth_scale": 1000.0} | keys
+    way_of_files(SimpleNamespace(**keys)).check(Named(names=names))
+    return True
+
+
+OF_DENSE = [
+    ({"folder": "."}, r"it has the folders (\w+): give one of them", {"folder": "{1}"}),
     (
-        (gone("run/points.ply"), {"formats": "'[colmap]'"}),
-        "lacks points.ply, which formats=colmap needs: run again",
-        *(fetched("run/points.ply"), FRUSTUMS),
+        (saved("v.npz", a=DENSE, b=DENSE), {"folder": "v.npz"}),
+        r"has a, b: name the depths one of (\w+),",
+        saved("v.npz", depths=DENSE, b=DENSE),
     ),
     (
-        (edit("run/metrics.json", ('"fingerprint": "', '"fingerprint": "0')), {"formats": "'[colmap]'"}),
-        r"not those that were mapped. formats=(\[frustums\]) needs no images",
-        {"formats": "'{1}'"},
+        (saved("v.npz", depths=DENSE[0]), {"folder": "v.npz"}),
+        r"must be depths \(frames, h, w\) of all frames",
+        saved("v.npz", depths=DENSE),
     ),
-    ({"images": "large", "formats": "'[colmap]'"}, "images must be one of (used), original", {"images": "{1}"}),
     (
-        gone("run/metrics.json"),
-        "holds no finished run: it lacks metrics.json; run it to its end",
-        fetched("run/metrics.json"),
+        tuple(put(f"png/{name}.png", color_image(0, (64, 48))) for name in NAMES) + ({"folder": "png"},),
+        r"coloured picture of depth, .*: let the program write values \(--grayscale --pred-only, .* .npy\)",
+        {"folder": "npy"},
+        tuple(put(f"png/{name}.png", np.uint8(200 * DENSE[0])) for name in NAMES),
+    ),
+    (
+        lambda root, said: np.save(root / "npy/IMG_8.npy", DENSE[0][:, :48]),
+        "where it was cropped, write it onto the whole image with 0",
+        lambda root, said: np.save(root / "npy/IMG_8.npy", np.where(np.arange(64) < 48, DENSE[0], 0)),
+    ),
+    (
+        gone("npy/IMG_9.npy"),
+        "no file for 1 of 6 frames, the first is IMG_9: predict it, or leave the frame out .dataset.start, stop",
+        *(fetched("npy/IMG_9.npy"), {"names": [NAMES[0]] + NAMES[2:]}),
+    ),
+    (
+        tuple(put(f"npy/{name}_conf.npy", b"") for name in NAMES)
+        + tuple(moved(f"npy/{name}.npy", f"npy/{name}_d.npy") for name in NAMES),
+        r"several kinds for each frame, \*_conf, \*_d: leave one kind",
+        tuple(gone(f"npy/{name}_conf.npy") for name in NAMES),
+    ),
+    (
+        {"names": ["a", "b", "c"]},
+        "name the files as the images, or choose the frames that were predicted",
+        *({"names": NAMES}, {"names": NAMES[:3]}),
+    ),
+    ({"depth_scale": 0.0}, "prior.dense.depth_scale must be raw units per metre, above 0", {"depth_scale": 1000.0}),
+]
+ENCODER = {"encoder_str": "dinov2", "torch_hub_pretrained": False}
+
+
+def write_weights(root: Path) -> None:
+    put("weights/config.json", json.dumps({"encoder_config": ENCODER}))(root, None)
+    put("weights/model.safetensors", "")(root, None)
+    put(f"hub/{DINOV2_CLONE}/hubconf.py", "")(root, None)
+
+
+def read_network(root: Path, folder: str | None = "weights", **keys) -> bool:
+    """What `prior=mapanything` looks at before it loads a network: the weights, its keys, the images of a window."""
+    check_checkpoint(None if folder is None else root / folder, root / "hub")
+    words = [f"prior.{key}={value}" for key, value in ({"resolution": "[56,42]"} | keys).items()]
+    data = Sphere(size=(40, 30))
+    with clear():
+        prior = build(compose("prior=mapanything", *words), "prior", load=lambda _: network_of(Double(data)))
+    return prior.provenance.name == "mapanything"
+
+
+WEIGHTS = "weights/config.json"
+OF_NETWORKS = [
+    (
+        {"folder": None},
+        "prior.checkpoint is not set: download the weights once .* and name the FOLDER",
+        {"folder": "weights"},
+    ),
+    (
+        {"folder": "hub"},
+        "no config.json and no model.safetensors: prior.checkpoint is the FOLDER",
+        {"folder": "weights"},
+    ),
+    (put(WEIGHTS, "{"), "is no configuration of MapAnything .*: repeat", fetched(WEIGHTS)),
+    (
+        put(WEIGHTS, json.dumps({"encoder_config": {"encoder_str": "dinov2"}})),
+        r'add ("torch_hub_pretrained": false) to its encoder_config',
+        lambda root, said: put(WEIGHTS, f'{{"encoder_config": {{"encoder_str": "dinov2", {said[1]}}}}}')(root, said),
+    ),
+    (
+        gone(f"hub/{DINOV2_CLONE}/hubconf.py"),
+        "clone .*dinov2 into that folder once",
+        fetched(f"hub/{DINOV2_CLONE}/hubconf.py"),
+    ),
+    ({"model": "vgg"}, r"prior.model must be one of (\w+), ", {"model": "{1}"}),
+    (
+        {"resolution": "[50,50]"},
+        r"in multiples of (14), or (null)",
+        {"resolution": "[28,{1}]"},
+        {"resolution": "'{2}'"},
+    ),
+    ({"resolution": "[518]"}, "must be .width, height. in multiples of 14", {"resolution": "[518,392]"}),
+    ({"anchor_pose": "maybe"}, r"must be (on) or (off)", {"anchor_pose": "'{1}'"}, {"anchor_pose": "'{2}'"}),
+    ({"anchor_depth_m": 0}, "must be above 0 m", {"anchor_depth_m": 2}),
+    ({"compute.amp": "fp8"}, "must be bf16, fp16 or (float32)", {"compute.amp": "{1}"}),
+    (
+        {"model": "vggt", "checkpoint": "weights"},
+        r"is for prior.model=(\w+)",
+        *({"model": "{1}"}, {"checkpoint": "'null'"}),
     ),
 ]
 
 
-def read_answer(root: Path, words: str | None = "sofa", **keys) -> dict:
-    given = {"map": root / "run", "text": words} | keys
-    return query(
-        compose(*(f"{key}={'null' if value is None else value}" for key, value in given.items()), name="query")
-    )
+@contextmanager
+def clear() -> Iterator[None]:
+    """What Hydra makes of an error, as a command says it."""
+    try:
+        yield
+    except InstantiationException as error:
+        raise ValueError(message_of(error)) from error
 
 
-LINE_OF_POSE = "1 0 0 0 0 0 0 1\n"
-OF_QUERY = [
+def write_model(root: Path, name: Callable[[int], str] = "{:02}.png".format) -> None:
+    """COLMAP's model of the images of a synthetic scene."""
+    from tests.structure.test_models import scene as synthetic
+
+    scene = synthetic()
+    for row, image in enumerate(scene.images.values()):
+        image.name = name(row)
+    (root / "model").mkdir(exist_ok=True)
+    scene.write_binary(root / "model")
+
+
+def named_model(name: Callable[[int], str]) -> Step:
+    return lambda root, said: write_model(root, name)
+
+
+def read_structure(root: Path, words: Sequence[str] = (), model: str = "model", names: Sequence[str] = ()) -> int:
+    """What `prior=multiview_stereo` makes of words and of a given model before it looks at images."""
+    with clear():
+        given = compose("prior=multiview_stereo", f"prior.structure.model='{root / model}'", *words)
+        config = build(given, "prior.structure", _convert_="all")
+    member("FeatureExtractorType", config.features, "features")
+    matcher_of(config)
+    options_of("FeatureExtractionOptions", config.options.get("extraction", {}))
+    names = names or [f"{row:02}" for row in range(8)]
+    taken = Shots(names, None, (160, 120), ("PINHOLE", (1, 1, 1, 1)), True)
+    return given_models(root / model, taken, config)[0].num_reg_images()
+
+
+OPTION = "+prior.structure.options"
+OF_STRUCTURE = [
     (
-        {"words": None},
-        "nothing is asked: give text=chair, text=.chair,table. or classes=FILE",
-        *({"words": "sofa"}, {"words": "'[sofa,wall]'"}, (put("c.txt", "sofa\n"), {"classes": "{root}/c.txt"})),
-    ),
-    ({"words": "soaf"}, r"the nearest are (\w+)\.", {"words": "{1}"}),
-    ({"words": "xyz"}, r"there are wall, (\w+)\.", {"words": "{1}"}),
-    ({"words": "'[sofa,sofa]'"}, "none empty and each once", {"words": "'[sofa,wall]'"}),
-    ({"against": "sofa"}, "asked for too: leave it out of one", {"against": "wall"}),
-    (
-        (put("p.txt", LINE_OF_POSE), {"frame": 1, "pose": "{root}/p.txt"}),
-        "both say from where to draw: give one of them",
-        *({"frame": None}, {"pose": None}),
-    ),
-    ({"frame": 77}, r"no pose of frame=77: choose one from (\d) to \d", {"frame": "{1}"}),
-    ({"pose": "{root}/p.txt"}, "is no file: give lines `timestamp tx ty tz qx qy qz qw`", put("p.txt", LINE_OF_POSE)),
-    ((put("p.txt", "# \n"), {"pose": "{root}/p.txt"}), "has no pose: give lines", put("p.txt", LINE_OF_POSE)),
-    ({"map": "{root}/nowhere"}, "is no folder: give the one that a run wrote", {"map": "{root}/run"}),
-]
-OF_CONFIG = [
-    ({"words": ["slam.em=papre"]}, r"with (slam/em=default)$", {"words": "['{1}']"}),
-    ({"words": ["em.num_neighbours=4"]}, r"near names: (slam\.em\.num_neighbours)", {"words": "['{1}=4']"}),
-    (
-        {"words": ["graph=default", "graph.location.patience=2"]},
-        r"is called (\S+) now",
-        {"words": "[graph=default, '{1}=2']"},
-    ),
-    ({"words": ["dataset=scannetpp"]}, r"there are apartment, bonn, (colmap)", {"words": "['dataset={1}']"}),
-    (
-        {"words": ["prior=simulated", "prior/dense=itermvs"]},
-        r"is a choice of (prior=\w+) only",
-        {"words": "['{1}', prior/dense=itermvs]"},
-    ),
-]
-
-
-def read_sweep(root: Path, words: list[str]) -> list:
-    config = compose(*words, name="sweep")
-    return variants(config, read_axes(config))
-
-
-def read_search(root: Path, words: list[str]) -> tuple:
-    config = compose(*words, name="tune")
-    return read_space(config), read_objectives(config)
-
-
-OF_SWEEP = [
-    (
-        {"words": []},
-        r"choose one with (sweep=gates) or '(axes=\S+)'$",
-        *({"words": "['{1}']"}, {"words": '["{2}"]'}),
-    ),
-    ({"words": ["axes={em.noise:[0]}"]}, r"near names: (slam\.em\.noise)", {"words": '["axes={{{1}:[0]}}"]'}),
-    ({"words": ["axes={slam.em.noise:2}"]}, r"write (\S+): \[(\d), …\]", {"words": '["axes={{{1}:[{2},3]}}"]'}),
-    (
-        {"words": ["axes={slam.em.noise:[0]}", "grid=all"]},
-        "grid must be one of product, (one_at_a_time)",
-        {"words": '["axes={{slam.em.noise:[0]}}", "grid={1}"]'},
+        {"words": [f"{OPTION}.sift.max_num_features=99"]},
+        r"there are (extraction)\.KEY=",
+        {"words": [f"{OPTION}.extraction.max_image_size=99"]},
     ),
     (
-        {"words": ["axes={slam.em.noise:[-9]}"]},
-        r"from (\d) to \S+, got -9",
-        {"words": '["axes={{slam.em.noise:[{1}]}}"]'},
-    ),
-]
-
-
-def space(key: str, given: str) -> dict[str, str]:
-    return {"words": f'["space={{{{{key}:{given}}}}}"]'}
-
-
-OF_SEARCH = [
-    ({"words": []}, r"with (tune=gates), or '(space=\S+)'$", {"words": "['{1}']"}, {"words": '["{2}"]'}),
-    (space("em.noise", "[0,1]"), r"near names: (slam\.em\.noise)", space("{1}", "[0,1]")),
-    (space("slam.em.noise", "[1]"), "two or more different numbers", space("slam.em.noise", "[1,2]")),
-    (space("slam.em.noise", "3"), "must be a range {low: …, high: …", space("slam.em.noise", "{{low:0.1,high:1}}")),
-    (
-        space("slam.em.noise", "{{low:1,high:0.1}}"),
-        "needs low < high, and low above 0 with log: true",
-        space("slam.em.noise", "{{low:0.1,high:1,log:true}}"),
+        {"words": [f"{OPTION}.extraction.max_size=99"]},
+        r"its options are .*\b(max_image_size)\b",
+        {"words": f"['{OPTION}.extraction.{{1}}=99']"},
     ),
     (
-        {"words": ["tune=gates", "objectives=[best]"]},
-        r"must be minimize METRIC or maximize METRIC",
-        {"words": '["tune=gates", "objectives=[minimize trajectory/ate_sim3_m]"]'},
+        {"words": ["prior.structure.mapper=hybrid"]},
+        "must be one of incremental, (global)",
+        {"words": "['prior.structure.mapper={1}']"},
+    ),
+    (
+        {"words": ["prior.structure.features=superpoint"]},
+        "pycolmap has (sift)",
+        {"words": "['prior.structure.features={1}']"},
+    ),
+    (
+        {"words": ["prior.structure.matcher=flann"]},
+        r"pycolmap has .*\b(sift_bruteforce)",
+        {"words": "['prior.structure.matcher={1}']"},
+    ),
+    ({"model": "nowhere"}, "does not exist: give the folder of a COLMAP model", {"model": "model"}),
+    ((put("empty/a", ""), {"model": "empty"}), "empty holds no model of COLMAP", {"model": "model"}),
+    ((put("empty/database.db", "x"), {"model": "empty"}), "is no database of COLMAP, or a dam", {"model": "model"}),
+    (
+        lambda root, said: (root / "model/points3D.bin").write_bytes(b"x"),
+        "is damaged: .*export the model again",
+        fetched("model/points3D.bin"),
+    ),
+    (
+        {"names": ["0", "1", "2"]},
+        "it has 00, 01, 02, …, this run 0, 1, 2, …; names count without folder and suffix",
+        *({"names": LEFT_OUT}, named_model("walk/{}.jpg".format)),
+    ),
+    (
+        named_model(lambda row: f"cam{row % 2}/{row // 2:02}.png"),
+        "has two images 00, and only their names tell them apart: export one folder's",
+        named_model("{:02}.png".format),
     ),
 ]
 TABLES = {
+    "bonn": (write_tum, frames(Bonn, sequence=TUM), OF_BONN),
+    "rosbag": (lambda root: bag()(root, None), frames(RosBag, sequence="walk", size=[160, 120]), OF_ROSBAG),
+    "masks": (write_masked, read_masked, OF_MASKS),
+    "recorded": (recorded, read_recorded, OF_RECORDED),
+    "dense": (write_dense, read_dense, OF_DENSE),
+    "networks": (write_weights, read_network, OF_NETWORKS),
+    "structure": (write_model, read_structure, OF_STRUCTURE),
     "tum": (write_tum, frames(Tum, sequence=TUM), OF_TUM),
     "seven_scenes": (write_seven_scenes, frames(SevenScenes, sequence=SEVEN), OF_SEVEN),
     "replica": (write_replica, frames(Replica, sequence="office9"), OF_REPLICA),
@@ -1041,38 +1077,12 @@ TABLES = {
     "predictions": (lambda root: write_npz(root / "own", NAMES), read_own, OF_PREDICTIONS),
     "calibration": (lambda root: None, lambda root, file: read_calibration(root / file), OF_CALIBRATIONS),
     "classes": (lambda root: None, lambda root, file: read_classes(root / file), OF_CLASSES),
-    "score": (write_peer, read_score, OF_SCORE),
-    "evaluate": (write_finished, read_plan, OF_EVALUATION),
-    "export": (written_with_points, read_export, OF_EXPORT),
-    "query": (written_with_points, read_answer, OF_QUERY),
-    "sweep": (lambda root: None, read_sweep, OF_SWEEP),
-    "tune": (lambda root: None, read_search, OF_SEARCH),
-    "config": (lambda root: None, lambda root, words: compose(*words), OF_CONFIG),
 }
-CASES = [(name, *row[:2], remedy) for name, (_, _, rows) in TABLES.items() for row in rows for remedy in row[2:]]
 
 
-@pytest.fixture(scope="module")
-def sound(tmp_path_factory):
-    """The folder of what is written in a layout, once."""
-
-    @cache
-    def written(name: str) -> Path:
-        folder = tmp_path_factory.mktemp(name)
-        TABLES[name][0](folder)
-        return folder
-
-    return written
+sound = sound_files(TABLES)
 
 
-@pytest.mark.parametrize(("name", "cause", "message", "remedy"), CASES, ids=[f"{c[0]}: {c[2][:40]}" for c in CASES])
+@each_remedy(TABLES)
 def test_what_a_message_advises_helps(name, cause, message, remedy, sound, tmp_path):
-    root, read = tmp_path / "copy", TABLES[name][1]
-    shutil.copytree(sound(name), root)
-    (tmp_path / "sound").symlink_to(sound(name))
-    options = done(cause, root)
-    with pytest.raises((ValueError, OSError)) as caught:
-        read(root, **options)
-    said = re.search(message, str(caught.value))
-    assert said is not None, caught.value
-    assert read(root, **options | done(remedy, root, said))
+    check_helps(TABLES[name][1], sound(name), cause, message, remedy, tmp_path)

@@ -132,6 +132,13 @@ def test_host_packages_stay_out_of_the_core(path):
     assert not inner(path) & HOST_FILES
 
 
+def test_the_mapping_does_not_read_its_log():
+    """Records are written from events and from the pose graph, by the files that run a sequence."""
+    log, mapping = {"mapping.records", "mapping.run"}, (PACKAGE / "mapping").glob("*.py")
+    readers = {path.stem for path in mapping if inner(path) & log}
+    assert readers == {"run", "pipeline", "checkpoint", "batch"}
+
+
 def test_no_two_files_of_tests_share_a_name():
     # Tests are collected as top-level modules: of two with one name pytest refuses the second, in a whole run only.
     names = [path.name for path in Path(__file__).parent.rglob("test_*.py")]

@@ -462,6 +462,24 @@ def test_depths_that_are_triangulated_have_no_field(camera, submap, lenient, sca
         np.testing.assert_allclose(aligned.points, moved, atol=1e-5)
 
 
+@pytest.mark.parametrize(
+    ("pose_std", "scale_std", "is_placed"),
+    [(1e-3, 1e-3, True), (1e-3, np.nan, True), (1e-3, 0.0, False), (1.0, 1e-3, False), (np.nan, np.nan, False)],
+)
+def test_a_pose_that_is_known_without_the_points_is_not_doubted_for_them(
+    camera, submap, lenient, pose_std, scale_std, is_placed
+):
+    """Depths of a network beside a map that they differ from: their error, where the pose is given and sure."""
+    settings = sc.changed(lenient, **{"icp.prior_information": 30.0, "max_residual": 0.0})
+    known = {"pose_covariance": np.tile(pose_std**2 * np.eye(6), (2, 1, 1)), "scale_std": np.float32(scale_std)}
+    before = sc.replace(CERTAIN, depth_noise=np.float32(0.05))  # of the frame before beside the map
+    prediction = sc.replace(nudged(camera), **known)
+    coarse = coarse_of(prediction, camera, settings, estimate=before)
+    _, _, info = fine_step(prediction.current, submap, coarse, settings)
+    assert coarse.is_placed == info.is_tracked == is_placed
+    assert int(info.reason) == (0 if is_placed else 4) and info.icp.residual > 0
+
+
 def test_a_scale_that_is_accepted_is_that_of_the_points_and_one_that_is_not_is_dropped(camera, submap, lenient):
     settings = sc.changed(lenient, **{"icp.prior_information": 30.0, "icp.scale_noise": 10.0})
     prediction = small_prediction(camera)

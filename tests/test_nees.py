@@ -2,10 +2,10 @@
 
 import numpy as np
 import pytest
+from hand_run import run_of
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.mapping.records import FrameRecord
-from emgs_jax.mapping.run import MappingRun
 from tools.nees.consistency import band, consistency, consistency_of_run, nees, pose_errors
 
 COUNT = 4000
@@ -57,7 +57,7 @@ def test_a_run_is_compared_from_its_first_frame_on_and_by_its_tracked_frames():
 
     records = [record("initialization", np.eye(4), np.eye(4), None), record("tracked", off, moved)]
     records += [record("degraded", 10 * off, moved), record("tracked", off, moved)]
-    assert consistency_of_run(MappingRun(None, None, records=records)).mean == pytest.approx(4.0 / 6.0)
+    assert consistency_of_run(run_of(records)).mean == pytest.approx(4.0 / 6.0)
 
 
 def test_the_band_is_that_of_the_mean_of_so_many_samples():

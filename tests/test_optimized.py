@@ -124,7 +124,7 @@ def test_the_fine_step_finds_the_pose_in_a_closed_room():
     start = sc.product(T, sc.pose((0.01, -0.02, 0.02), (0.03, 0.02, -0.03)))
     covariance = sc.device(np.diag([1e-3] * 6 + [1e-4]))
     belief = PoseEstimate(covariance, *map(sc.device, (0.01, 0.0, 1.0)), no_repeats(), jnp.asarray(False))
-    coarse = CoarsePose(start, start, *map(sc.device, (1.0, 0.02, 2.0, 0.01)), belief, *[jnp.asarray(True)] * 3)
+    coarse = CoarsePose(start, start, *map(sc.device, (1.0, 0.02, 2.0, 0.01)), belief, *[jnp.asarray(True)] * 4)
     found, aligned, info = optimised(localize_fine, current, walls, coarse, config)
     assert info.is_tracked and info.icp.num_inliers > 2500 and aligned.valid.all()
     assert max(sc.pose_error(found, T)) < 0.01 < 0.02 < min(sc.pose_error(start, T))

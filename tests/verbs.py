@@ -73,7 +73,7 @@ def belief_of(seed: int) -> pose_estimate.PoseEstimate:
 
 def coarse_of(seed: int) -> localization.CoarsePose:
     T, numbers = sc.path_pose(2 + seed), map(sc.device, (1.0, 0.02, 2.0, 0.01))
-    return localization.CoarsePose(T, T, *numbers, belief_of(seed), *[jnp.asarray(True)] * 3)
+    return localization.CoarsePose(T, T, *numbers, belief_of(seed), *[jnp.asarray(True)] * 4)
 
 
 def estep_of(seed: int) -> em.EStep:

@@ -46,6 +46,7 @@ class FrameData:
         points: camera frame, m of its inference, (h, w, 3).
         mask: of these, (h, w).
         T_anchor_views: by frame index, the poses (4, 4) that its inference predicts; some may not be finite.
+        covariance: (6, 6) of its pose, see `FrameRecord`; None without one.
         depth_noise: ν of the points, as they differ from the map; None where the frame was not tracked: the few points
             that are near the map by chance do not count.
     """
@@ -56,6 +57,7 @@ class FrameData:
     mask: np.ndarray
     T_anchor_views: Mapping[int, np.ndarray]
     depth_noise: float | None = None
+    covariance: np.ndarray | None = None
 
     @property
     def depth(self) -> float:

@@ -35,7 +35,7 @@ def detect_loops(end: BackEnd, frame: FrameData) -> BackEnd:
     end = replace(end, database=add_keyframe(end.database, _keyframe(end, time, frame), config))
     row = len(end.database.keyframes) - 1
     for candidate in propose_candidates(end.database, row, config):
-        if _submap_id_of(end, candidate.row) == end.submap_id:
+        if _submap_id_of(end, candidate.row) == end.active:
             end = _verify_candidate(end, row, candidate.row)
     return end
 
@@ -62,7 +62,7 @@ def relocalize_frame(
         in_other_submap: search the other submap that has the most similar keyframe, with a free ratio of units.
     """
     query = _keyframe(end, len(end.nodes), frame)
-    submap_id = _most_similar_submap(end, query) if in_other_submap else end.submap_id
+    submap_id = _most_similar_submap(end, query) if in_other_submap else end.active or 0
     if submap_id is None:
         return None, NO_CANDIDATE
     is_there = [node.is_placed and node.submap == submap_id for node in end.nodes]
@@ -74,7 +74,7 @@ def relocalize_frame(
 def _most_similar_submap(end: BackEnd, query: Keyframe) -> int | None:
     """Find the other submap with the most similar keyframe that is in the map; None without one."""
     keyframes = end.database.keyframes
-    others = [row for row in range(len(keyframes)) if _submap_id_of(end, row) != end.submap_id]
+    others = [row for row in range(len(keyframes)) if _submap_id_of(end, row) != end.active]
     others = [row for row in others if end.nodes[keyframes[row].frame].is_placed]
     found = most_similar(end.database, query, others, 1, end.config.place_recognition)
     return _submap_id_of(end, found[0].row) if found else None
@@ -119,7 +119,7 @@ def _verify_candidate(end: BackEnd, row: int, other: int) -> BackEnd:
     """Verify a loop between two keyframes, rows of the database, the later first, and record the outcome."""
     keyframes = end.database.keyframes
     candidate, rows = keyframes[other], (k for k in (other - 1, other + 1) if 0 <= k < row)
-    beside = [keyframes[k] for k in rows if _submap_id_of(end, k) == end.submap_id]
+    beside = [keyframes[k] for k in rows if _submap_id_of(end, k) == end.active]
     neighbours = neighbours_of(candidate, beside, end.poses, end.log_scales)
     loop, info = verify(keyframes[row], candidate, neighbours, _verification_config(end, is_free=False))
     if info.violation is not None:

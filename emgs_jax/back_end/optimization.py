@@ -31,7 +31,7 @@ _merge = eqx.filter_jit(merge_all_duplicates)
 def close_loops(end: BackEnd, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> tuple[BackEnd, SlamState]:
     """Optimize with `loops` as further factors and deform the map; a refused solution moves nothing."""
     factors = [*end.factors, *map(loop_factor, loops)]
-    before, solver = nodes_of(end, end.submap_id), end.config.solver
+    before, solver = nodes_of(end, end.active), end.config.solver
     if not end.has_one_unit:  # the scales are not all about 1
         solver = replace(solver, scale_std=jnp.asarray(math.inf))
     after, info = optimize(PoseGraph(before, stack_factors(factors)), solver)

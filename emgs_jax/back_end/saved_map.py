@@ -69,7 +69,7 @@ def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
     arrays = {name: np.array([getattr(node, field) for node in end.nodes]) for name, field in NODES.items()} | {
         "words": end.database.words
     }
-    arrays["is_kept"] = np.array([node.submap == end.submap_id for node in end.nodes])
+    arrays["is_kept"] = np.array([node.submap == end.active for node in end.nodes])
     arrays |= {f"keyframes.{name}": np.stack([getattr(one, name) for one in keyframes]) for name in OF_KEYFRAMES}
     arrays |= {f"keyframes.{name}": np.concatenate([getattr(one, name) for one in keyframes]) for name in OF_POINTS}
     arrays["keyframes.num_points"] = np.array([len(one.pixels) for one in keyframes])

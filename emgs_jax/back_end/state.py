@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from emgs_jax.back_end.factors import Factor, FrameData, NoiseConfig, map_factor, sequential_factor
-from emgs_jax.geometry import Sim3
+from emgs_jax.geometry import Sim3, scale_covariance
 from emgs_jax.loop_closure.consistency import ConsistencyConfig
 from emgs_jax.loop_closure.place_recognition import Database, PlaceRecognitionConfig
 from emgs_jax.loop_closure.prior_query import PriorQueryConfig
@@ -59,6 +59,9 @@ class Node:
         frame: index in the data set.
         submap: disconnected submap that holds it; the relative pose of two submaps is not known.
         is_placed: True in the map: the frame is neither degraded nor lost.
+        covariance: (6, 6) of `online`, see `FrameRecord`; None where it has none, or is of a saved map, which is exact.
+        origin: node whose Gaussians it was registered to; None where it was not.
+        depth_noise: how much its points differ from the map, as a fraction of their depth; None where it was not.
     """
 
     pose: np.ndarray
@@ -67,6 +70,9 @@ class Node:
     frame: int
     submap: int = 0
     is_placed: bool = True
+    covariance: np.ndarray | None = None
+    origin: int | None = None
+    depth_noise: float | None = None
 
 
 @dataclass(frozen=True)
@@ -92,6 +98,7 @@ class BackEnd:
     """State of the back end: nodes, factors and loops of the pose graph so far. Nothing of it is ever changed in place.
 
     Args:
+        config: None: nodes alone, poses stay as first estimated.
         min_std: floor of the map's covariances.
         database: keyframes; their `frame` is the node.
         verified: loops that passed every gate of two keyframes.
@@ -102,11 +109,11 @@ class BackEnd:
         closures: optimizations so far.
         first_node: of this run's first frame; those before are of the run that saved the map.
         connected_since: node since which consecutive frames are connected; before it the camera was lost.
-        submap_id: of the next node.
+        active: submap of the next node, where the camera is; None before it is in the saved map, submap 0.
         has_one_unit: the inferences of all nodes have one unit, as far as the prior has.
     """
 
-    config: BackEndConfig
+    config: BackEndConfig | None
     intrinsics: tuple[float, float, float, float]
     min_std: float
     nodes: Sequence[Node] = ()
@@ -120,7 +127,7 @@ class BackEnd:
     closures: Sequence[Closure] = field(default_factory=list)
     first_node: int = 0
     connected_since: int = 0
-    submap_id: int = 0
+    active: int | None = 0
     has_one_unit: bool = True
 
     @property
@@ -145,8 +152,11 @@ def add_node(
         is_placed: the map holds it: it was registered to it, or the map was made from it.
     """
     time, pose = len(end.nodes), np.asarray(pose, np.float64)
-    node = Node(pose, pose, float(np.log(scale)), frame.index, end.submap_id, is_placed)
+    known = {"covariance": frame.covariance, "origin": origin, "depth_noise": frame.depth_noise}
+    node = Node(pose, pose, float(np.log(scale)), frame.index, end.active, is_placed, **known)
     end = replace(end, nodes=(*end.nodes, node))
+    if end.config is None:
+        return end
     sequential = sequential_factor(frame, end.poses, end.log_scales, partial(_is_connected, end), end.config.noise)
     factors = [] if sequential is None else [sequential]
     if origin is not None and origin < time:
@@ -161,10 +171,12 @@ def _is_connected(end: BackEnd, row: int) -> bool:
 
 
 def transform_nodes(end: BackEnd, rows: Collection[int], similarity: Sim3) -> BackEnd:
-    """Map the poses and scales of some nodes to another world."""
+    """Map poses, covariances and scales of some nodes to another world."""
 
     def moved(node: Node) -> Node:
         pose, online = map(similarity.apply_to_poses, (node.pose, node.online))
-        return replace(node, pose=pose, online=online, log_scale=node.log_scale + float(np.log(similarity.scale)))
+        log_scale, covariance = node.log_scale + float(np.log(similarity.scale)), node.covariance
+        covariance = None if covariance is None else scale_covariance(covariance, similarity.scale)
+        return replace(node, pose=pose, online=online, log_scale=log_scale, covariance=covariance)
 
     return replace(end, nodes=tuple(moved(node) if row in rows else node for row, node in enumerate(end.nodes)))

@@ -20,15 +20,17 @@ class LabelFolder:
         folder: of PNG images of ids with one channel, 8 or 16 bits.
         classes: file that names them, see `data.class_file`; names without ids count from 0.
         unknown: ids that mean that there is no class, also where they have a name; None: 0, unless it has one.
+        key: where a user says `unknown`; "" = nowhere.
 
     Raises:
         ValueError: the folder or the file is not there, or the file names no classes, or an id twice.
     """
 
-    def __init__(self, folder: Path, classes: Path, unknown: Collection[int] | None = None) -> None:
+    def __init__(self, folder: Path, classes: Path, unknown: Collection[int] | None = None, key: str = "") -> None:
         if not folder.is_dir():
             raise ValueError(f"{folder} is no folder: give one with a class image (PNG) for every image")
         self.folder, self.classes = folder, classes
+        self._remedy = f", or say with {key}=[…] which ids mean no class" if key else ""
         known = read_classes(classes)
         self.names = known.names
         positions = {row: row for row in range(len(self.names))} if known.positions is None else known.positions
@@ -66,7 +68,7 @@ class LabelFolder:
         try:
             return self._known.positions_of(ids, path).astype(np.int32)
         except ValueError as error:
-            raise BadFrameError(f"{error}, or say with `unknown` which ids mean no class") from error
+            raise BadFrameError(f"{error}{self._remedy}") from error
 
 
 def as_unknown(unknown: Sequence[int] | None, key: str) -> tuple[int, ...] | None:

@@ -86,7 +86,10 @@ def check_size(size: Sequence[int]) -> Size:
 def check_depth_scale(depth_scale: Number, what: str = "dataset.depth_scale") -> float:
     """`depth_scale` as a positive finite number; `what` says where it stands."""
     if not (math.isfinite(depth_scale) and depth_scale > 0):
-        raise ValueError(f"{what} must be raw units per metre (5000 for TUM), got {depth_scale}")
+        raise ValueError(
+            f"{what} must be raw units per metre, above 0, got {depth_scale}: correct it, or leave the key out for the "
+            "data set's own"
+        )
     return float(depth_scale)
 
 

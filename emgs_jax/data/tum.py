@@ -94,7 +94,7 @@ class Tum(Straightened):
         self._labels = None
         if labels is not None:
             ids = as_unknown(unknown, "dataset.unknown")
-            self._labels = LabelFolder(self._folder / labels, self._folder / classes, ids)
+            self._labels = LabelFolder(self._folder / labels, self._folder / classes, ids, "dataset.unknown")
         self.classes = () if self._labels is None else self._labels.names
 
     def _associate(self, tolerance: float) -> tuple[list[Path | None] | None, list[list[str] | None] | None]:

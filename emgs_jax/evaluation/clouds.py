@@ -18,7 +18,7 @@ from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
 _PART_ROWS = 500_000  # points that are averaged together: bounds the memory, does not change the result
-_SOME = 61  # every so manieth point says where a cloud is divided
+SOME = 61  # every so manieth point says where a cloud is divided
 
 
 @dataclass(frozen=True)
@@ -153,7 +153,7 @@ class SpooledCloud:
         rows = np.concatenate([cloud.points, cloud.normals, cloud.colors], axis=1)
         rows = rows[np.isfinite(rows[:, :3]).all(axis=1)].astype(self._dtype)
         self._parts.append(rows)
-        self._some.append(rows[::_SOME, :3].copy())
+        self._some.append(rows[::SOME, :3].copy())
         self._count, self._averaged = self._count + len(rows), None
 
     def __len__(self) -> int:
@@ -164,7 +164,7 @@ class SpooledCloud:
         with self._averaging:
             if self._averaged is None or self._averaged[0] != voxel:
                 parts = (self._parts[row] for row in range(len(self._parts)))
-                edges = _edges(np.concatenate(self._some), len(self), voxel)
+                edges = cell_edges(np.concatenate(self._some), len(self), voxel)
                 self._averaged = voxel, _average(parts, edges, voxel)
             return self._averaged[1]
 
@@ -255,7 +255,7 @@ def _cloud(rows: np.ndarray) -> PointCloud:
     return PointCloud(*(rows[:, begin : begin + 3].astype(np.float64) for begin in (0, 3, 6)))
 
 
-def _edges(some: np.ndarray, count: int, voxel: float) -> np.ndarray:
+def cell_edges(some: np.ndarray, count: int, voxel: float) -> np.ndarray:
     """Numbers of the cells that part `count` points into ranges of about `_PART_ROWS`, as `some` (n, 3) are spread."""
     numbers, num_parts = np.sort(cell_numbers(some, voxel)), -(-count // _PART_ROWS)
     return numbers[len(numbers) * np.arange(1, num_parts) // max(num_parts, 1)]

@@ -25,6 +25,7 @@ from emgs_jax.geometry import Sim3
 from emgs_jax.ops.ranges import number
 
 Metrics = dict[str, float | int | str | None]
+_PART_ROWS = 500_000  # points that are aligned together: bounds the memory, does not change the result
 _BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is computed in between stays in the cache
 
 
@@ -185,10 +186,11 @@ def align_points(
 ) -> np.ndarray:
     """Bring points (n, 3) of the estimate to where `compare_clouds` compares its cloud."""
     alignment, _ = align_poses(*poses, with_scale=config.alignment == "sim3")
-    aligned = alignment.apply(points)
     if config.icp_distance_m == 0:
-        return aligned
-    return _moved(coarse_points([aligned], config.icp_voxel_m), truth, config.icp_distance_m, config).apply(aligned)
+        return alignment.apply(points)
+    parts = (alignment.apply(points[row : row + _PART_ROWS]) for row in range(0, len(points), _PART_ROWS))
+    source = coarse_points(parts, config.icp_voxel_m)
+    return (_moved(source, truth, config.icp_distance_m, config) @ alignment).apply(points)
 
 
 def _moved(source: np.ndarray, truth: Reference, distance: float, config: EvaluationConfig) -> Sim3:

@@ -14,14 +14,13 @@ from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.class_file import ClassFile
 from emgs_jax.data.spool import Spool
-from emgs_jax.evaluation.clouds import NearestPoints, cell_centers, cell_numbers
+from emgs_jax.evaluation.clouds import SOME, NearestPoints, cell_centers, cell_edges, cell_numbers
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_points, own_voxel
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.geometry import rotated
 from emgs_jax.io.ply_reader import read_vertices
 
 _VOTED_ROWS = 200_000  # points that are given a class together: bounds the memory, does not change the result
-_SEEN = np.dtype([("cell", np.int64), ("label", np.int32), ("views", np.int32)])  # a class in a voxel, by so many views
 _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
 
 
@@ -114,46 +113,6 @@ def nearest_classes(features: np.ndarray, text_features: np.ndarray) -> np.ndarr
     return np.where(features.any(-1), scores.argmax(-1), -1)
 
 
-class LabelGrid:
-    """Counts which classes are seen in each voxel [m] of the world, once a view."""
-
-    def __init__(self, voxel: float) -> None:
-        self._voxel, self._rows = voxel, [np.empty(0, _SEEN)]  # the first is what was merged
-
-    def add(self, points: np.ndarray, labels: np.ndarray) -> None:
-        """Add a view: points (n, 3) and their classes (n,); what has none or is not finite is left out."""
-        known = (labels >= 0) & np.isfinite(points).all(-1)
-        pairs = _distinct(np.column_stack([labels[known], cell_numbers(points[known], self._voxel)]))
-        rows = np.ones(len(pairs), _SEEN)
-        rows["label"], rows["cell"] = pairs.T
-        self._rows.append(rows)
-        if sum(map(len, self._rows[1:])) > max(_MERGE_ROWS, len(self._rows[0]) // 2):
-            self._merge()
-
-    def points(self, classes: Sequence[str]) -> LabelledPoints:
-        """The centre of every voxel with the class of most views; of equally frequent ones the first."""
-        rows = self._merge()
-        begins = np.flatnonzero(np.diff(rows["cell"], prepend=-1))
-        labels = np.empty(0, np.int64)
-        if len(begins):
-            most = np.repeat(np.maximum.reduceat(rows["views"], begins), np.diff(begins, append=len(rows)))
-            labels = np.where(rows["views"] == most, rows["label"], np.iinfo(np.int32).max)
-            labels = np.minimum.reduceat(labels, begins).astype(np.int64)
-        return LabelledPoints(cell_centers(rows["cell"][begins], self._voxel), labels, tuple(classes))
-
-    def _merge(self) -> np.ndarray:
-        """Rows by cell and class, each pair once, which are kept; of a long walk they are gigabytes."""
-        rows, self._rows = np.concatenate(self._rows), []
-        rows = rows[np.lexsort((rows["label"], rows["cell"]))]
-        is_new = (np.diff(rows["cell"], prepend=-1) != 0) | (np.diff(rows["label"], prepend=-1) != 0)
-        begins = np.flatnonzero(is_new)
-        merged = rows[begins]
-        if len(begins):
-            merged["views"] = np.add.reduceat(rows["views"], begins)
-        self._rows = [merged]
-        return merged
-
-
 class SpooledLabels:
     """The points of many views with their classes, in a temporary file, counted once the side of a voxel is known.
 
@@ -161,19 +120,41 @@ class SpooledLabels:
     """
 
     def __init__(self, classes: Sequence[str]) -> None:
-        self._parts, self._classes = Spool(), tuple(classes)
+        self._parts, self._some, self._count, self._classes = Spool(), [np.empty((0, 3))], 0, tuple(classes)
 
     def append(self, points: np.ndarray, labels: np.ndarray) -> None:
-        """Add a view: points (n, 3) and their classes (n,)."""
-        self._parts.append(np.column_stack([points, labels]).astype(np.float32))
+        """Add a view: points (n, 3) and their classes (n,); what has none or is not finite is left out."""
+        known = (labels >= 0) & np.isfinite(points).all(-1)
+        rows = np.column_stack([points[known], labels[known]]).astype(np.float32)
+        self._parts.append(rows)
+        self._some.append(rows[::SOME, :3].astype(np.float64))
+        self._count += len(rows)
 
     def points(self, voxel: float) -> LabelledPoints:
-        """As `LabelGrid.points`, for voxels of this side [lengths of the points]."""
-        grid = LabelGrid(voxel)
+        """The centre of every voxel [lengths of the points] with the class of most views.
+
+        A view counts once in a voxel; of equally frequent classes it is the first.
+        """
+        edges, spread = cell_edges(np.concatenate(self._some), self._count, voxel), Spool()
+        places: list[list[int]] = [[] for _ in range(len(edges) + 1)]
         for row in range(len(self._parts)):
-            part = self._parts[row].astype(np.float64)
-            grid.add(part[:, :3], part[:, 3].astype(np.int64))
-        return grid.points(self._classes)
+            view = self._parts[row]
+            pairs = _distinct(np.column_stack([view[:, 3].astype(np.int64), cell_numbers(view[:, :3], voxel)]))
+            for place, own in zip(places, np.split(pairs, np.searchsorted(pairs[:, 1], edges)), strict=True):
+                if len(own):
+                    place.append(spread.append(own))
+        found = [_most_seen(np.concatenate([spread[row] for row in place])) for place in filter(None, places)]
+        whole = np.concatenate([np.empty((0, 2), np.int64), *found])
+        return LabelledPoints(cell_centers(whole[:, 1], voxel), whole[:, 0].astype(np.int32), self._classes)
+
+
+def _most_seen(rows: np.ndarray) -> np.ndarray:
+    """The most frequent label of each cell, of equally frequent ones the first; rows (n, 2) of a label and a cell."""
+    rows = rows[np.lexsort(rows.T)]
+    begins = np.flatnonzero((np.diff(rows, axis=0, prepend=-1) != 0).any(1))
+    pairs, views = rows[begins], np.diff(begins, append=len(rows))
+    order = np.lexsort((pairs[:, 0], -views, pairs[:, 1]))
+    return pairs[order[np.diff(pairs[order, 1], prepend=-1) != 0]]
 
 
 def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray, num_neighbours: int) -> np.ndarray:

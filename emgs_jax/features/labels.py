@@ -33,7 +33,7 @@ class LabelFeatures:
 
     def __init__(self, folder: str, names: str, unknown: Sequence[int] | None = None, text: str | None = None) -> None:
         ids = as_unknown(unknown, "features.unknown")
-        self._labels = LabelFolder(Path(folder).expanduser(), Path(names).expanduser(), ids)
+        self._labels = LabelFolder(Path(folder).expanduser(), Path(names).expanduser(), ids, "features.unknown")
         self._names_file, self._file = names, text
         self.settings = {"folder": Path(folder).name, "unknown": None if ids is None else [*ids]}
 

@@ -18,10 +18,14 @@ from jaxtyping import Array, Int
 from emgs_jax.data.base import Dataset
 from emgs_jax.device.clock import Timer
 from emgs_jax.device.executables import call
+from emgs_jax.mapping.atlas import with_state
 from emgs_jax.mapping.capacity import advance, start
 from emgs_jax.mapping.convert import FirstWindow
-from emgs_jax.mapping.pipeline import finish_run, integrate, seconds_of
-from emgs_jax.mapping.run import MappingRun, TrackedFrame, record_lost, record_start, record_step
+from emgs_jax.mapping.event import Event
+from emgs_jax.mapping.integrate import lost_event, seconds_of, start_event, step_event, update_graph
+from emgs_jax.mapping.pipeline import finish_run, map_input, with_atlas
+from emgs_jax.mapping.records import records_of
+from emgs_jax.mapping.run import MappingRun
 from emgs_jax.mapping.window_input import RawView, WindowInput, window_inputs
 from emgs_jax.observation import Observation, Prediction
 from emgs_jax.ops.camera import Camera
@@ -91,7 +95,7 @@ def finish_together(groups: Iterable[MappingRun | Stack]) -> list[MappingRun]:
 
 
 def _integrate(group: MappingRun | Stack, window: WindowInput) -> MappingRun | Stack:
-    return integrate_stack(group, window) if isinstance(group, Stack) else integrate(group, window)[0]
+    return integrate_stack(group, window) if isinstance(group, Stack) else map_input(group, window)[0]
 
 
 def make_stack(runs: Sequence[MappingRun]) -> Stack:
@@ -105,23 +109,31 @@ def integrate_stack(group: Stack, window: WindowInput) -> Stack:
     timer, camera = Timer(runs[0].clock), runs[0].camera
     match window.prediction:
         case None:
-            return group._replace(runs=[record_lost(run, window) for run in runs])
+            return group._replace(runs=[_with_event(run, window, lost_event(run.atlas, window)) for run in runs])
         case FirstWindow() as first:
-            group = Stack(runs, *start(first, camera, configs, init_states))
-            seconds = seconds_of(window, timer, len(runs))
-            return group._replace(runs=[record_start(run, window, seconds) for run in unstacked(group)])
+            group, infos = Stack(runs, *start(first, camera, configs, init_states)), None
         case prediction:
             states, infos, configs = advance(states, prediction, camera, configs, step_states)
-            infos, seconds = jax.device_get(infos), seconds_of(window, timer, len(runs))
-            frames = [TrackedFrame(info=_item(infos, position)) for position in range(len(runs))]
-            runs = [record_step(run, window, frame, seconds) for run, frame in zip(runs, frames, strict=True)]
-            return Stack(runs, states, configs)
+            group, infos = Stack(runs, states, configs), jax.device_get(infos)
+    seconds = seconds_of(window, timer, len(runs))
+
+    def with_outcome(position: int, run: MappingRun) -> MappingRun:
+        event = start_event(run.atlas, window) if infos is None else step_event(run.atlas, _item(infos, position))
+        return _with_event(run, window, replace(event, seconds=seconds))
+
+    return group._replace(runs=[with_outcome(position, run) for position, run in enumerate(unstacked(group))])
+
+
+def _with_event(run: MappingRun, window: WindowInput, event: Event) -> MappingRun:
+    """Write what became of an input's frames into pose graph and log."""
+    run = replace(run, records=(*run.records, *records_of(window, event)))
+    return with_atlas(run, update_graph(run.atlas, window, event))
 
 
 def unstacked(group: Stack) -> list[MappingRun]:
     """Return the runs, each with its own state and config."""
     own = (_item((group.states, group.configs), position) for position in range(len(group.runs)))
-    return [replace(run, state=state, config=config) for run, (state, config) in zip(group.runs, own, strict=True)]
+    return [replace(run, atlas=with_state(run.atlas, *both)) for run, both in zip(group.runs, own, strict=True)]
 
 
 def _item(tree: Tree, position: int) -> Tree:

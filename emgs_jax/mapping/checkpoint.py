@@ -1,30 +1,42 @@
-"""Checkpoints: a run that was stopped resumes from its map and records after some input, saved in one file.
+"""Checkpoints: a run that was stopped resumes from its maps and its log after some input, saved in one file.
 
-Frames are read and predicted from the start again, because what they carry along (landmarks of a window, the raw
-predictions' points, keyframes) follows from that alone, the same every time. The steps are not replayed: state and
-records come from the file, so that the result has the same bits as that of an uninterrupted run.
+Frames are read and predicted from the start again, because what a prior and its inputs carry along (landmarks of a
+window, raw poses) follows from that alone, the same every time. Nothing of it is mapped again: the maps and the pose
+graph come from the file, so that the result has the same bits as that of an uninterrupted run.
 """
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-import jax
-import jax.numpy as jnp
-import numpy as np
+import jaxlie
 
+from emgs_jax.back_end.factors import Factor
+from emgs_jax.back_end.state import BackEnd, Closure, Node, Refusal
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import changes, jsonable
 from emgs_jax.io.npz import load_headed, save_headed
-from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.io.structs import pack, unpack
+from emgs_jax.loop_closure.place_recognition import Database, Keyframe
+from emgs_jax.loop_closure.verification import LoopMeasurement
+from emgs_jax.mapping.atlas import Atlas, Submap
+from emgs_jax.mapping.records import FrameRecord, with_moved_nodes
 from emgs_jax.mapping.run import MappingRun
+from emgs_jax.mapping.world import World
+from emgs_jax.motion import Looks
+from emgs_jax.observation import Observation
 from emgs_jax.ops.ranges import number
+from emgs_jax.pose_graph.optimize import PoseGraphInfo
+from emgs_jax.registration.pose_estimate import PoseEstimate
+from emgs_jax.registration.pose_noise import Repeats
 from emgs_jax.slam import SlamState
 
 CHECKPOINT_FILE = "checkpoint.npz"
-FORMAT, VERSION = "emgs_jax.checkpoint", 7
-POSES = tuple(field.name for field in fields(FrameRecord) if field.name.endswith("pose"))
-MATRICES = dict.fromkeys(POSES, 4) | {"covariance": 6, "similarity": 4}  # of a record, and how many rows they have
+FORMAT, VERSION = "emgs_jax.checkpoint", 8
+OF_MAPS = (Submap, World, SlamState, GaussianMap, Gaussians, Observation, Looks, PoseEstimate, Repeats, jaxlie.SE3)
+OF_GRAPH = (BackEnd, Node, Factor, LoopMeasurement, Refusal, Closure, PoseGraphInfo, Database, Keyframe)
 
 
 @dataclass(frozen=True)
@@ -43,49 +55,32 @@ class Checkpoint:
     """A run after some of its inputs.
 
     Args:
-        leaves: of the state, in the order of `jax.tree.leaves`; none before there is a map.
+        atlas: without camera and config, which the run that resumes has.
+        capacities: of the map and the submap of a step.
         records: as the frames were placed.
-        inactive: leaves of the states of the other disconnected submaps, by their number.
     """
 
     num_inputs: int
-    leaves: Sequence[np.ndarray]
+    atlas: Atlas
     capacities: tuple[int, int]
     records: Sequence[FrameRecord]
-    inactive: Mapping[int, Sequence[np.ndarray]] = field(default_factory=dict)
 
     def restored(self, run: MappingRun) -> MappingRun:
-        """Rebuild states and config in a run whose inputs were replayed; its state has any size."""
+        """Set the atlas and the log of a run that resumes."""
         names = ("map_capacity", "submap_capacity")
         submap = replace(run.config.submap, **dict(zip(names, self.capacities, strict=True)))
-
-        def state(leaves: Sequence[np.ndarray]) -> SlamState:
-            return jax.tree.unflatten(jax.tree.structure(run.state), [jnp.asarray(leaf) for leaf in leaves])
-
-        inactive = {submap: state(leaves) for submap, leaves in self.inactive.items()}
-        current = state(self.leaves) if len(self.leaves) else None
-        return replace(run, state=current, inactive=inactive, config=replace(run.config, submap=submap))
+        graph = replace(self.atlas.graph, config=run.atlas.graph.config)
+        known = {"camera": run.camera, "config": replace(run.config, submap=submap), "graph": graph}
+        records = with_moved_nodes(self.records, (), graph.nodes)
+        return replace(run, atlas=replace(self.atlas, **known), records=records)
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint, signature: Mapping[str, Any]) -> None:
     """Write a checkpoint of the run that `signature` (as JSON has it) tells from others; the old one is replaced."""
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "signature": jsonable(signature),
-        "num_inputs": checkpoint.num_inputs,
-        "capacities": checkpoint.capacities,
-        "num_leaves": len(checkpoint.leaves),
-        "aside": list(checkpoint.inactive),
-        "records": [{k: v for k, v in vars(record).items() if k not in MATRICES} for record in checkpoint.records],
-    }
-    arrays = {f"leaf_{row}": np.asarray(leaf) for row, leaf in enumerate(checkpoint.leaves)}
-    for submap, leaves in checkpoint.inactive.items():
-        arrays |= {f"aside_{submap}_{row}": np.asarray(leaf) for row, leaf in enumerate(leaves)}
-    for name, size in MATRICES.items():
-        nothing = np.full((size, size), np.nan)  # stands for None
-        found = [nothing if getattr(r, name) is None else getattr(r, name) for r in checkpoint.records]
-        arrays[name] = np.asarray(found, np.float64).reshape(-1, size, size)
+    graph = replace(checkpoint.atlas.graph, config=None)
+    checkpoint = replace(checkpoint, atlas=replace(checkpoint.atlas, camera=None, config=None, graph=graph))
+    said, arrays = pack(checkpoint)
+    header = {"format": FORMAT, "version": VERSION, "signature": jsonable(signature), "checkpoint": said}
     save_headed(path, header, arrays)
 
 
@@ -99,15 +94,10 @@ def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
         header, arrays = load_headed(path, {"format": FORMAT, "version": VERSION})
         if changed := changes(header["signature"], jsonable(signature)):
             raise ValueError(f"it is of another run: {changed[0]}")
-        matrices = [{name: arrays[name][row] for name in MATRICES} for row in range(len(header["records"]))]
-        records = [
-            FrameRecord(**line, **{name: None if np.isnan(rows).any() else rows for name, rows in found.items()})
-            for line, found in zip(header["records"], matrices, strict=True)
-        ]
-        rows = range(header["num_leaves"])
-        inactive = {submap: [arrays[f"aside_{submap}_{row}"] for row in rows] for submap in header["aside"]}
-        leaves = [arrays[f"leaf_{row}"] for row in rows]
-        return Checkpoint(header["num_inputs"], leaves, tuple(header["capacities"]), records, inactive)
+        found = unpack(header["checkpoint"], arrays, (Checkpoint, Atlas, FrameRecord, *OF_MAPS, *OF_GRAPH))
+        if not isinstance(found, Checkpoint):
+            raise ValueError("it holds no checkpoint")
+        return found
     except OSError as error:
         raise ValueError(f"{path} cannot be read: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError) as error:
@@ -150,10 +140,7 @@ class Keeper:
         if not self._every or run is None or len(placed) <= self._num_saved:
             return
         capacities = run.config.submap.map_capacity, run.config.submap.submap_capacity
-        leaves = jax.device_get(jax.tree.leaves(run.state))
-        others = {submap: jax.device_get(jax.tree.leaves(one)) for submap, one in run.inactive.items()}
-        checkpoint = Checkpoint(num_inputs, leaves, capacities, placed, others)
-        save_checkpoint(self.path, checkpoint, self._signature)
+        save_checkpoint(self.path, Checkpoint(num_inputs, run.atlas, capacities, placed), self._signature)
         self._num_saved = len(placed)
 
     def drop(self) -> None:

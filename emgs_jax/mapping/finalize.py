@@ -18,8 +18,7 @@ from emgs_jax.device.executables import stored
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.geometry import Sim3, seen_from
 from emgs_jax.localization import LocalizationConfig
-from emgs_jax.mapping.records import transform_record
-from emgs_jax.mapping.run import MappingRun
+from emgs_jax.mapping.atlas import Atlas, with_state
 from emgs_jax.observation import Observation, depth_in
 from emgs_jax.registration.pose_estimate import PoseEstimate, rescale_estimate
 from emgs_jax.registration.pose_noise import LEAST_NOISE, axis_std
@@ -57,20 +56,26 @@ def _own_std(
     return axis_std(estimate.repeats, jnp.zeros((2, 2)), *guess, *known)[0]
 
 
-def with_first_frame(run: MappingRun) -> MappingRun:
-    """Add `own_covariance`, seen from each frame, to those of a run that ends; those in a saved map have none."""
-    if run.state is None or run.saved is not None:
-        return run
-    own = own_covariance(run.state, run.config.localization)
-    rows = [row for row, record in enumerate(run.records) if record.covariance is not None]
-    if not rows or not own.any():
-        return run
-    first = next(record.pose for record in run.records if record.pose is not None)
-    added = seen_from(own, first, np.stack([run.records[row].pose for row in rows]))
-    records = list(run.records)
-    for row, covariance in zip(rows, added, strict=True):
-        records[row] = replace(records[row], covariance=records[row].covariance + covariance)
-    return replace(run, records=tuple(records), first_covariance=own)
+def with_first_frame(atlas: Atlas, first: np.ndarray) -> tuple[Atlas, np.ndarray | None]:
+    """Add `own_covariance`, seen from each frame, to those of a run that ends; those in a saved map have none.
+
+    Args:
+        first: pose of the first frame, (4, 4).
+
+    Returns:
+        The atlas, and what was added of the first frame; None: nothing.
+    """
+    graph = atlas.graph
+    rows = [row for row, node in enumerate(graph.nodes) if node.covariance is not None]
+    if atlas.state is None or graph.first_node or not rows:
+        return atlas, None
+    own = own_covariance(atlas.state, atlas.config.localization)
+    if not own.any():
+        return atlas, None
+    nodes = list(graph.nodes)
+    for row, added in zip(rows, seen_from(own, first, np.stack([nodes[row].pose for row in rows])), strict=True):
+        nodes[row] = replace(nodes[row], covariance=nodes[row].covariance + added)
+    return replace(atlas, graph=replace(graph, nodes=tuple(nodes))), own
 
 
 def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
@@ -86,24 +91,17 @@ def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
     return rescaled(state, np.exp(-float(state.estimate.log_scale)), origin) if state.estimate.log_scale else state
 
 
-def rescale_run(run: MappingRun) -> MappingRun:
-    """Apply `in_prior_unit` to a run that ends, its records and its back end included.
+def rescale_atlas(atlas: Atlas, first: np.ndarray) -> Atlas:
+    """Apply `in_prior_unit` to a run that ends, its pose graph included, about the `first` camera's pose (4, 4).
 
     A saved map keeps its unit, and so does one of joined submaps: the mean is of the last one's inferences.
     """
-    end = run.back_end
-    if run.state is None or run.saved is not None or not run.state.estimate.log_scale:
-        return run
-    if end is not None and not end.has_one_unit:
-        return run
-    origin = next(record.pose for record in run.records if record.pose is not None)[:3, 3]  # the anchor's
-    similarity = Sim3.about(origin, np.exp(-float(run.state.estimate.log_scale)))
-    return replace(
-        run,
-        state=in_prior_unit(run.state, origin),
-        records=tuple(transform_record(record, similarity) for record in run.records),
-        back_end=end and transform_nodes(end, range(len(end.nodes)), similarity),
-    )
+    graph, state = atlas.graph, atlas.state
+    if state is None or graph.first_node or not graph.has_one_unit or not state.estimate.log_scale:
+        return atlas
+    similarity = Sim3.about(first[:3, 3], np.exp(-float(state.estimate.log_scale)))
+    graph = transform_nodes(graph, range(len(graph.nodes)), similarity)
+    return with_state(replace(atlas, graph=graph), in_prior_unit(state, first[:3, 3]), atlas.config)
 
 
 def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:

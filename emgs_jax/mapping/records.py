@@ -1,4 +1,4 @@
-"""Records of frames, and alarms about those in a row that do not fit the map: nothing is fused while that lasts.
+"""The log of a run: a record of each frame, which the mapping never reads, and alarms about frames that do not fit.
 
 A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; files write it as TUM's seven numbers.
 """
@@ -12,20 +12,23 @@ from typing import Any
 import numpy as np
 from tqdm import tqdm
 
-from emgs_jax.geometry import Sim3, scale_covariance
+from emgs_jax.back_end.state import Node
+from emgs_jax.device.arrays import to_matrix
 from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
+from emgs_jax.mapping.event import JOINED, NEW_SUBMAP, RESTARTED, Event
+from emgs_jax.mapping.window_input import WindowInput
+from emgs_jax.slam import StepInfo
 
 IN_MAP = ("tracked", "initialization")  # statuses of frames that the map holds
 APART = "apart"  # status of a frame that a submap holds which was never joined with the map
 UNPLACED = ("lost", APART)  # statuses of frames whose pose says nothing in the map
-# Outcomes of relocalization, `FrameRecord.location`; files have these words.
-RELOCALIZED, RESTARTED, NEW_SUBMAP, JOINED = "found", "anew", "segment", "joined"
 HIDDEN = "moving things fill the view"
 NOT_FOUND = "its place in the saved map is not found"
 UNJOINED = "its submap was never joined with the map (unjoined)"
 MANY_IN_A_ROW = 10  # single frames fail in every long sequence, so many together do not
 UNTRACKED = ("degraded", "lost")
+MOST_MOVING = 0.5  # of the pixels; where more move it is they that hide the map
 REMEDIES = dict(
     zip(
         REASONS,
@@ -63,7 +66,7 @@ class FrameRecord:
         pose: T_world_camera; of a lost frame what stands in for it.
         raw_pose: the same by the raw prediction; that of the frame before where it has none.
         true_pose: None where unknown.
-        newest_pose: temporary pose of the next frame.
+        newest_pose: temporary pose of the next frame, as first estimated.
         covariance: (6, 6) of ξ where the true pose is T Exp(ξ), translation (m), rotation (rad); of the pose as first
             estimated, relative to the first frame (to a saved map in one).
         inliers: points that agree with the map.
@@ -129,15 +132,95 @@ def records_apart(records: Sequence[FrameRecord], number: int) -> list[FrameReco
     return [record for record in records if record.submap == number and record.status == APART]
 
 
-def transform_record(record: FrameRecord, similarity: Sim3) -> FrameRecord:
-    """Map poses, covariance and scale of a record to another world."""
-    poses = {name: getattr(record, name) for name in ("pose", "newest_pose")}
-    return replace(
-        record,
-        **{name: None if pose is None else similarity.apply_to_poses(pose) for name, pose in poses.items()},
-        covariance=None if record.covariance is None else scale_covariance(record.covariance, similarity.scale),
-        scale=None if record.scale is None else similarity.scale * record.scale,
-    )
+def records_of(window: WindowInput, event: Event) -> list[FrameRecord]:
+    """Make the records of an input's frames, which share its seconds."""
+    share = {name: value / len(event.poses) for name, value in event.seconds.items()}
+    described = _described(event)
+    return [
+        FrameRecord(
+            index=frame.index,
+            name=frame.name,
+            timestamp=frame.timestamp,
+            raw_pose=raw.T_world_camera,
+            true_pose=frame.T_world_camera,
+            left_out=raw.num_left_out,
+            pose=pose,
+            location=event.location,
+            **described | share,
+        )
+        for frame, raw, pose in zip(window.frames, window.raw, event.poses, strict=True)
+    ]
+
+
+def _described(event: Event) -> dict[str, Any]:
+    """Return the fields of a record that an event fills."""
+    if event.info is None and not event.is_start:
+        return {"status": "lost", "reason": REASONS[0] if event.location is None else NOT_FOUND}
+    if event.info is None:
+        new = event.num_gaussians if event.location == NEW_SUBMAP else None
+        return {"status": "initialization", "scale": 1.0, "new": new, "num_gaussians": event.num_gaussians}
+    fields = _step_fields(event.info) | {"similarity": event.similarity, "covariance": event.covariance}
+    fields |= {"depth_noise": event.depth_noise, "origin": event.origin, "num_gaussians": event.num_gaussians}
+    if event.is_start:
+        return fields | {"status": "initialization", "new": event.num_gaussians - int(event.info.num_gaussians)}
+    return fields | ({"fused": 0, "updated": 0, "new": 0} if event.is_frozen else {})
+
+
+def _step_fields(info: StepInfo) -> dict[str, Any]:
+    """Return the fields of a record that a step fills; `info` is on the host."""
+    localization, em, refinement = info.localization, info.em, info.refinement
+    reasons = [words for bit, words in enumerate(REASONS) if int(localization.reason) >> bit & 1]
+    moving = float(np.mean(info.moving))
+    reasons = [HIDDEN] if reasons and moving > MOST_MOVING else reasons
+    return {
+        "status": "tracked" if localization.is_tracked else "lost" if localization.is_lost else "degraded",
+        "reason": "; ".join(reasons) or None,
+        "newest_pose": to_matrix(info.T_world_newest.wxyz_xyz),
+        "inliers": int(localization.icp.num_inliers),
+        "residual": float(localization.icp.residual),
+        "scale": float(localization.scale),
+        "step_m": float(localization.step_m),
+        "step_rad": float(localization.step_rad),
+        "repeat_rms": float(localization.repeat_rms),
+        "moving": moving,
+        "fused": int(em.num_fused),
+        "updated": int(em.num_updated),
+        "mean_log_joint": float(em.mean_log_joint) if em.num_fused else None,
+        "candidates": int(refinement.num_candidates),
+        "refined": int(refinement.num_merged),
+        "new": int(refinement.num_fresh),
+        "overflow": int(info.overflow.tiles),
+    }
+
+
+def with_moved_nodes(
+    records: Sequence[FrameRecord], before: Sequence[Node], after: Sequence[Node]
+) -> Sequence[FrameRecord]:
+    """Write pose, scale and covariance of nodes that have changed into their records: the last node has the last one.
+
+    Args:
+        before: nodes when the records were written, but for those that were added with the last records.
+    """
+    found, first = list(records), len(records) - len(after)
+    for row in range(max(0, -first), len(after)):
+        node, record = after[row], found[first + row]
+        is_same = node is before[row] if row < len(before) else np.array_equal(node.pose, record.pose)
+        if not is_same:
+            scale = None if record.scale is None else float(np.exp(node.log_scale))
+            found[first + row] = replace(record, pose=node.pose, scale=scale, covariance=node.covariance)
+    return tuple(found)
+
+
+def with_unjoined_apart(records: Sequence[FrameRecord], nodes: Sequence[Node], kept: int) -> Sequence[FrameRecord]:
+    """Mark the records of all nodes that are not in the kept submap: it was never joined with theirs."""
+    found, first = list(records), len(records) - len(nodes)
+    for row in range(max(0, -first), len(nodes)):
+        node, record = nodes[row], found[first + row]
+        if node.submap != kept:
+            status = APART if record.status in IN_MAP else "lost"
+            known = {"status": status, "reason": UNJOINED, "submap": node.submap, "covariance": node.covariance}
+            found[first + row] = replace(record, **known)
+    return tuple(found)
 
 
 def to_line(record: FrameRecord) -> dict[str, Any]:

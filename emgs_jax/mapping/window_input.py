@@ -65,20 +65,6 @@ class WindowInput:
         ]
 
 
-@dataclass(frozen=True)
-class PlacedStructure:
-    """Pose of the prior's own world in that of the disconnected submap that was started in it.
-
-    Args:
-        number: `WindowInput.structure`.
-        T_world_anchor: (4, 4), of the frame with which the submap started.
-    """
-
-    number: int
-    T_world_structure: np.ndarray
-    T_world_anchor: np.ndarray
-
-
 def window_inputs(
     dataset: Dataset, prior: Prior, config: SlamConfig, clock: Clock | None = None
 ) -> Iterator[WindowInput]:

@@ -42,6 +42,7 @@ from emgs_jax.prior.base import (
     with_frames,
 )
 from emgs_jax.prior.recorded_checks import (
+    COMPLETE,
     FIELDS,
     OPTIONAL,
     REMEDY,
@@ -111,7 +112,7 @@ class Recorded(Prior):
         if not self._manifest["complete"]:
             total = self._manifest["num_inferences"]
             done = sum(self.has_whole(f"{number:06d}.npz") for number in range(total))
-            raise ValueError(f"{self.folder} holds {done} of {total} inferences: finish it, {REMEDY}")
+            raise ValueError(f"{self.folder} holds {done} of {total} inferences: {COMPLETE}")
         self.provenance = Provenance(**self._manifest["provenance"])
         if self._pose_std is not None:
             settings = self.provenance.settings | {"pose_std": [*self._pose_std]}
@@ -176,10 +177,10 @@ class Recorded(Prior):
         """Read and verify one file of the recording."""
         path = self.folder / name
         if not path.is_file():
-            raise ValueError(f"{path} is missing: {REMEDY}")
+            raise ValueError(f"{path} is missing: {COMPLETE}")
         content = path.read_bytes()
         if hashlib.sha256(content).hexdigest() != self._manifest["files"].get(name):
-            raise ValueError(f"{path} is damaged (its SHA-256 is not the manifest's): delete it and {REMEDY}")
+            raise ValueError(f"{path} is damaged (its SHA-256 is not the manifest's): {COMPLETE}")
         try:
             return read_npz(content, keys, optional)
         except ValueError as error:
@@ -240,7 +241,7 @@ def _read_manifest(folder: Path) -> dict:
     if manifest.get("version") not in READABLE:
         raise ValueError(f"{path} has version {manifest.get('version')}, this program reads {READABLE}: {REMEDY}")
     if manifest.pop("sha256", None) != _digest(manifest):
-        raise ValueError(f"{path} is damaged (its SHA-256 does not fit): delete the folder and {REMEDY}")
+        raise ValueError(f"{path} is damaged (its SHA-256 does not fit): {REMEDY}")
     check_manifest(path, manifest)
     return manifest
 

@@ -7,7 +7,8 @@ import numpy as np
 
 from emgs_jax.data.reading import is_rigid
 
-REMEDY = "record it again with `python -m experiments.predict`"
+COMPLETE = "`python -m experiments.predict`, called as for the others, makes what is missing or damaged"
+REMEDY = "record into another folder with `python -m experiments.predict`"
 FIELDS = {  # array -> dtype and the axes that it has; d, v, h, w, i, j, c, k, l have one length each, y, x, f are free
     "T_anchor_view": (np.float64, "vij"),
     "points": (np.float32, "dhwc"),

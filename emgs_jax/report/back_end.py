@@ -26,7 +26,7 @@ def metric_graph(end: BackEnd) -> PoseGraph:
         sqrt_info = edge.sqrt_info / np.array([scale] * 3 + [1.0] * 4)
         return edge._replace(Z_a_b=scale_pose(edge.Z_a_b, scale), log_ratio=0.0, sqrt_info=sqrt_info)
 
-    nodes = nodes_of(end, end.submap_id)
+    nodes = nodes_of(end, end.active)
     return PoseGraph(
         replace(nodes, log_scale=jnp.zeros_like(nodes.log_scale)), stack_factors([*map(scaled, end.factors)])
     )

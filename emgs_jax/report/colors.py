@@ -5,6 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 
 from emgs_jax.io.files import atomic_write
 
@@ -57,6 +58,8 @@ def to_bytes(values: np.ndarray) -> np.ndarray:
 
 
 def save_figure(path: str | os.PathLike, figure: Figure) -> None:
-    """Write a figure as PNG, whole or not at all."""
+    """Write a figure as PNG, whole or not at all; a "$" in its texts is one, as names of files and classes have it."""
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
     with atomic_write(path) as handle:
         figure.savefig(handle, format="png", dpi=110)

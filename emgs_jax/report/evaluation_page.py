@@ -8,7 +8,7 @@ from markupsafe import Markup
 
 from emgs_jax.report.columns import MAIN, Cell, Line, Table, known, metric_table
 from emgs_jax.report.html import MAX_LINES, Head, link, page, picture, thumbnails, write_page
-from emgs_jax.report.provenance import RAW_PRIOR
+from emgs_jax.report.provenance import RAW_PRIOR, in_unit, length_words
 from emgs_jax.report.recorded_run import REPORT_FILE
 from emgs_jax.report.results import METRICS_FILE, Estimate, read_metrics
 from emgs_jax.report.tables import COLUMNS, Row, over
@@ -75,9 +75,10 @@ def verdict(found: Found) -> tuple[str, str]:
 def run_facts(metrics: Mapping[str, Any]) -> str:
     """Say the error of the path beside the prior's, and the frames, in one line."""
     ours, raw = (metrics.get(prefix + MAIN[0].key) for prefix in ("", RAW_PRIOR))
-    words = ["no ground truth"] if ours is None else [f"path off by {100 * ours:.1f} cm"]
+    block = metrics.get("provenance", {})
+    words = ["no ground truth"] if ours is None else [f"path off by {length_words(ours, block)}"]
     if ours is not None and raw is not None:
-        words[0] += f" (prior alone: {100 * raw:.1f} cm)"
+        words[0] += f" (prior alone: {length_words(raw, block)})"
     counts = {status: metrics.get(f"frames/{status}") for status in ("tracked", "degraded", "lost", "skipped")}
     return ", ".join([*words, *(f"{count} {status}" for status, count in counts.items() if count)])
 
@@ -103,5 +104,6 @@ def _errors(rows: Sequence[Row]) -> Table:
         rivals = row.dataset, row.sequences, row.protocol, row.is_simulated
         lines.append(Line(labels, row.values, row.spreads, rivals))
     titles = ("data set", "sequence", "setting", "", "source", "protocol", "seeds")
-    table = metric_table(titles, known(COLUMNS, lines), lines)
+    columns = in_unit(known(COLUMNS, lines), {row.dataset for row in rows})
+    table = metric_table(titles, columns, lines)
     return table._replace(lines=table.lines[:MAX_LINES])

@@ -7,6 +7,7 @@ import numpy as np
 
 from emgs_jax.report.colors import PATHS, STATUS_COLORS
 from emgs_jax.report.page_words import loop_words
+from emgs_jax.report.provenance import has_metric_truth
 from emgs_jax.report.recorded_run import RecordedRun
 
 HEIGHT = 100.0  # units of a row's picture; one unit across is a frame
@@ -39,8 +40,9 @@ def strip(run: RecordedRun, errors: dict[str, np.ndarray]) -> list[Row]:
     ends = [f"{run.frames[0]['index']} – {run.frames[-1]['index']}"] if run.frames else []
     rows = [Row("frames", "", 20, ends, _statuses(run))]
     if errors:
-        curves = {name: 100 * errors[name] for name in ERRORS if name in errors}
-        rows.append(_curves("error of the position", "cm", curves, 64))
+        factor, unit = (100, "cm") if has_metric_truth(run.provenance) else (1, "units")
+        curves = {name: factor * errors[name] for name in ERRORS if name in errors}
+        rows.append(_curves("error of the position", unit, curves, 64))
     inliers, residual, scale, new, seconds, compiling = (
         _numbers(run, name) for name in ("inliers", "residual", "scale", "new", "seconds", "compile_seconds")
     )

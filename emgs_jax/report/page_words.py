@@ -6,10 +6,10 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 from emgs_jax.mapping.records import APART
-from emgs_jax.report import columns, provenance
+from emgs_jax.report import columns
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
 from emgs_jax.report.html import Head, commit_words
-from emgs_jax.report.provenance import RAW_PRIOR
+from emgs_jax.report.provenance import RAW_PRIOR, in_unit, length_words, lines_of
 from emgs_jax.report.recorded_run import POLISH, RecordedRun, sound
 from emgs_jax.report.repeat import Repeated
 
@@ -110,16 +110,11 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
     if ours is None:
         level = "bad" if is_lost else "mixed" if is_degraded else "unknown"
         return level, f"{tracked}. There is no ground truth that errors could be told from."
-    has_metres = provenance.has_metric_truth(run.provenance)
-
-    def length(value: float) -> str:
-        return f"{100 * value:.1f} cm" if has_metres else f"{value:.3g} units of the reference"
-
-    words = f"The path is off by {length(ours)} (RMS, placed with its scale)"
+    words = f"The path is off by {length_words(ours, run.provenance)} (RMS, placed with its scale)"
     is_worse = raw is not None and ours > raw
     if raw:
         change = f"{100 * abs(1 - ours / raw):.0f} % {'more' if is_worse else 'less'}"
-        words += f", {change} than the prior alone ({length(raw)})"
+        words += f", {change} than the prior alone ({length_words(raw, run.provenance)})"
     key = "rendering/depth_within_5_percent"
     met, met_raw = metrics.get(key), metrics.get(RAW_PRIOR + key)
     if met is not None and met_raw is not None:
@@ -148,11 +143,12 @@ def errors(run: RecordedRun) -> Table | None:
     metrics = run.metrics
     if not any(MAIN[0].key in key for key in metrics):
         return None
-    lines = [line._replace(rivals=()) for line in provenance.lines_of(metrics, _COLUMNS)]
+    all_columns = in_unit(_COLUMNS, [run.provenance["data"]["name"]])
+    lines = [line._replace(rivals=()) for line in lines_of(metrics, all_columns)]
     online = {key: metrics.get(key.replace("trajectory/", "trajectory_online/")) for key, *_ in _COLUMNS[:2]}
     if any(value is not None for value in online.values()):
         lines.insert(1, Line(["ours, as placed"], online))
-    return columns.transposed(columns.metric_table([""], columns.known(_COLUMNS, lines), lines))
+    return columns.transposed(columns.metric_table([""], columns.known(all_columns, lines), lines))
 
 
 def protocol_words(run: RecordedRun) -> str:

@@ -18,7 +18,7 @@ from emgs_jax.mapping.records import (
 )
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, aligned, metric_table
-from emgs_jax.report.provenance import has_metric_truth, lines_of
+from emgs_jax.report.provenance import in_unit, lines_of
 
 MANY = 0.1  # share of frames
 MUCH = 0.03  # share of pixels; less may be wrong predictions
@@ -86,12 +86,10 @@ def metrics_table(metrics: Mapping[str, Any]) -> str:
     is rendered of them at their own poses.
     """
     block, tables = metrics.get("provenance", {}), []
+    names = [str((block.get("data") or {}).get("name"))]
     for columns in ((MAIN[0], *PLACED), (*BY_PATH, *RENDERED)):
         if lines := lines_of(metrics, columns):
-            table = metric_table([_label(block)], columns, lines)
-            is_metric = has_metric_truth(block)
-            titles = [title if is_metric else title.replace("[cm]", "[.01 units]") for title in table.titles]
-            tables.append(aligned(table._replace(titles=titles)))
+            tables.append(aligned(metric_table([_label(block)], in_unit(columns, names), lines)))
     return "\n\n".join(tables)
 
 

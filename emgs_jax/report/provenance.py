@@ -4,7 +4,7 @@ import importlib.metadata
 import os
 import platform
 import subprocess
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +25,7 @@ ROWS = {  # prefix of the metrics of an estimate -> what it is
     "baseline_tsdf_raw/": "TSDF, raw poses",
     "baseline_tsdf_ours/": "TSDF, our poses",
 }
+_OWN_UNITS = ("colmap", "nerfstudio")  # data sets whose true poses are in a unit of their own
 _GROUPS = ("trajectory/", "reconstruction/", "segmentation/", "map/", "time/")
 _PACKAGES = {
     "jax": ("jax",),
@@ -112,8 +113,20 @@ def is_metric(settings: Mapping[str, Any]) -> bool:
 
 
 def has_metric_truth(block: Mapping[str, Any]) -> bool:
-    """Test whether the true poses of a result are in metres: COLMAP and nerfstudio have units of their own."""
-    return (block.get("data") or {}).get("name") not in ("colmap", "nerfstudio")
+    """Test whether the true poses of a result are in metres."""
+    return (block.get("data") or {}).get("name") not in _OWN_UNITS
+
+
+def in_unit(columns: Iterable[Column], names: Collection[str]) -> list[Column]:
+    """Titles of lengths as they are for data sets of these names: in centimetres, or in the truth's own unit."""
+    own = [name in _OWN_UNITS for name in names]
+    unit = "cm or .01 units" * (not all(own)) or ".01 units"
+    return [c._replace(title=c.title.replace("[cm]", f"[{unit}]")) if any(own) else c for c in columns]
+
+
+def length_words(length: float, block: Mapping[str, Any]) -> str:
+    """A length of the truth in centimetres, or in units of its own."""
+    return f"{100 * length:.1f} cm" if has_metric_truth(block) else f"{length:.3g} units of the reference"
 
 
 def lines_of(metrics: Mapping[str, Any], columns: Sequence[Column]) -> list[Line]:

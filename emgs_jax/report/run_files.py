@@ -21,7 +21,8 @@ from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE
-from emgs_jax.mapping.records import APART, NEW_SUBMAP, UNJOINED, UNPLACED, records_apart
+from emgs_jax.mapping.event import NEW_SUBMAP
+from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, records_apart
 from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig

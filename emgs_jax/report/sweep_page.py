@@ -9,7 +9,7 @@ from emgs_jax.config.overrides import written
 from emgs_jax.report.columns import MAIN, Column, Line, Table, known, metric_table
 from emgs_jax.report.evaluation_page import run_facts
 from emgs_jax.report.html import MAX_LINES, Head, commit_words, page, picture, thumbnails, write_page
-from emgs_jax.report.provenance import RAW_PRIOR
+from emgs_jax.report.provenance import RAW_PRIOR, in_unit
 from emgs_jax.report.repeat import repeat
 from emgs_jax.report.sweeps import picture_path
 
@@ -24,8 +24,8 @@ def write_sweep_page(folder: Path, block: Mapping[str, Any], rows: Rows, axes: S
         rows: a flat row for each setting, at least one.
         command: that repeats the sweep; "" where nobody knows.
     """
-    columns = known(MAIN, [Line((), row) for row in rows])
     name, prior = str(block["data"]["name"]), str(block["prior"]["name"])
+    columns = in_unit(known(MAIN, [Line((), row) for row in rows]), [name])
     title, words = f"{name} {block['data']['sequence']}", _best_words(rows, axes, columns)
     about = f"Protocol {block['protocol']}; {commit_words(block.get('git'))}, on {block['device']['kind']}"
     names = f"{title}: sweep", f"Sweep: {title}", f"prior {prior}"

@@ -19,6 +19,7 @@ from emgs_jax.report.columns import (
     markdown,
     metric_table,
 )
+from emgs_jax.report.provenance import in_unit
 from emgs_jax.report.results import Estimate
 
 _PAPER_DATASETS = {"seven_scenes": "7-Scenes", "tum": "TUM"}
@@ -121,7 +122,8 @@ def full_table(rows: Sequence[Row]) -> str:
         method = f"{row.kind}, {row.variant}"
         labels = [row.dataset, over(row.sequences), method, source_of(row), row.protocol, str(len(row.seeds))]
         lines.append(Line(labels, row.values, row.spreads, rivals=None))
-    return markdown(metric_table(["data set", "sequence", "method", "source", "protocol", "seeds"], COLUMNS, lines))
+    columns = in_unit(COLUMNS, {row.dataset for row in rows})
+    return markdown(metric_table(["data set", "sequence", "method", "source", "protocol", "seeds"], columns, lines))
 
 
 def over(sequences: Sequence[str]) -> str:

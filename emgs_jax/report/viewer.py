@@ -217,7 +217,10 @@ def check_port(port: int) -> None:
 
 
 def _taken(port: int) -> str:
-    return f"port={port} is taken by another program, or not allowed: give another one, such as port={port + 1}"
+    with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as free:
+        free.bind((HOST, 0))
+        other = free.getsockname()[1]
+    return f"port={port} is taken by another program, or not allowed: give another one, such as port={other}"
 
 
 def _shown(words: str) -> str:

@@ -57,8 +57,6 @@ class StructureConfig:
     options: Mapping[str, Any] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
-        if not isinstance(self.masks, Masks):
-            raise ValueError(f"prior.structure.masks={self.masks} is masks.folder={self.masks} now")
         for part, values in self.options.items():
             if part not in PARTS or not isinstance(values, Mapping):
                 raise ValueError(

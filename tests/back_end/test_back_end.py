@@ -31,12 +31,12 @@ from emgs_jax.geometry import scale_pose
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe
 from emgs_jax.loop_closure.prior_query import JointPrediction
 from emgs_jax.loop_closure.verification import LoopMeasurement
-from emgs_jax.mapping import loop_closing
-from emgs_jax.mapping.loop_closing import finish_back_end
-from emgs_jax.mapping.pipeline import update_back_end
-from emgs_jax.mapping.records import FrameRecord
-from emgs_jax.mapping.run import MappingRun
+from emgs_jax.mapping import integrate
+from emgs_jax.mapping.atlas import Atlas, Submap
+from emgs_jax.mapping.event import Event
+from emgs_jax.mapping.integrate import finish_back_end, update_graph
 from emgs_jax.mapping.window_input import WindowInput
+from emgs_jax.mapping.world import World
 from emgs_jax.pose_graph.deform import DeformConfig
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph, residuals
 from emgs_jax.registration.pose_estimate import exact_estimate
@@ -85,6 +85,10 @@ def walked(graph, poses: np.ndarray, scale: float = 1.0) -> BackEnd:
     for index, pose in enumerate(poses):
         end = add_node(end, look(poses, index), pose, scale, max(index - 3, 0))
     return end
+
+
+def atlas_of(end: BackEnd, state: SlamState) -> Atlas:
+    return Atlas(None, None, end, {0: Submap(state)})
 
 
 def changed(end: BackEnd, **columns) -> BackEnd:
@@ -136,16 +140,12 @@ def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_clos
     poses, log_scale = ring(), 0.05
     end = walked(graph, poses, np.exp(log_scale))
     state = eqx.tree_at(lambda s: s.estimate.log_scale, state_of(poses), jnp.asarray(log_scale))
-    records = [FrameRecord(row, None, None, "tracked", pose=pose, scale=1.05) for row, pose in enumerate(poses)]
-    records[0] = FrameRecord(0, None, None, "initialization", pose=poses[0], scale=1.0)
     smaller = np.stack([scale_pose(pose, 0.9) for pose in poses])
     end = replace(end, verified=[loop(smaller, row) for row in range(1, 9)])
-    run = MappingRun(None, None, state=state, records=records, back_end=end)
-    run = finish_back_end(run)
-    end = run.back_end
+    atlas = finish_back_end(atlas_of(end, state))
+    end = atlas.graph
     assert end.accepted and log_scale - np.mean(end.log_scales) > 1e-3  # `scale_std` asks for scales of one
-    assert float(run.state.estimate.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
-    np.testing.assert_allclose([record.scale for record in run.records], np.exp(end.log_scales))
+    assert float(atlas.state.estimate.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
 
 
 def test_loops_that_are_contradicted_later_are_no_edges_any_more(graph):
@@ -167,29 +167,27 @@ def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatc
     end, loops = walked(graph, drifted), [loop(truth, row) for row in range(1, 9)]
     end = replace(end, verified=list(loops))
     end, state = close_loops(end, state_of(drifted), loops)
-    records = [FrameRecord(row, None, None, "tracked", pose=pose) for row, pose in enumerate(end.poses)]
-    motion = jaxlie.SE3.from_matrix(jnp.asarray(ring()[7], jnp.float32))
-    run = MappingRun(None, None, state=state, records=records, back_end=end, prior_motion=motion)
+    before, motion = end.nodes[-1].pose, jaxlie.SE3.from_matrix(jnp.asarray(ring()[7], jnp.float32))
+    atlas = replace(atlas_of(end, state), world=World(motion=motion))
     frame, raw = SimpleNamespace(index=COUNT - 1, image=None), SimpleNamespace(points=None, mask=None)
-    given = WindowInput((frame,), (raw,), None, None, {}, {})
-    monkeypatch.setattr(loop_closing, "add_node", lambda end, *arguments: end)
-    monkeypatch.setattr(loop_closing, "detect_loops", lambda end, frame: end)
-    run = update_back_end(run, given)
-    assert run.back_end.accepted == loops and len(run.back_end.closures) == 1 and run.prior_motion is motion
+    given = WindowInput((frame,), (raw,), None, None, {}, {}), Event(np.eye(4)[None])
+    monkeypatch.setattr(integrate, "add_node", lambda end, *arguments: end)
+    monkeypatch.setattr(integrate, "detect_loops", lambda end, frame: end)
+    atlas = update_graph(atlas, *given)
+    assert atlas.graph.accepted == loops and len(atlas.graph.closures) == 1 and atlas.world.motion is motion
 
     def contradict(end: BackEnd, frame: FrameData) -> BackEnd:
         return replace(end, violating=[loop(truth, row) for row in (9, 10)])
 
-    monkeypatch.setattr(loop_closing, "detect_loops", contradict)
-    run = update_back_end(run, given)
-    end = run.back_end
+    monkeypatch.setattr(integrate, "detect_loops", contradict)
+    atlas = update_graph(atlas, *given)
+    end = atlas.graph
     assert not end.accepted and len(end.closures) == 2
     assert error(end.poses, drifted) < 0.01
-    assert error([record.pose for record in run.records], end.poses) == 0
     # What the prior says of the next frame is as far from this one as before.
-    change = end.poses[-1] @ np.linalg.inv(records[-1].pose)
+    change = end.poses[-1] @ np.linalg.inv(before)
     assert np.linalg.norm(change[:3, 3]) > 1e-3
-    np.testing.assert_allclose(run.prior_motion.as_matrix(), change @ motion.as_matrix(), atol=1e-5)
+    np.testing.assert_allclose(atlas.world.motion.as_matrix(), change @ motion.as_matrix(), atol=1e-5)
 
 
 def test_a_loop_that_cannot_be_solved_changes_nothing(graph):
@@ -459,15 +457,13 @@ def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
     truth, drifted = ring(), ring(1.95 * np.pi)
     loops = [loop(truth, row) for row in range(1, 5)]
     end = replace(with_keyframes(walked(graph, drifted)), verified=loops)
-    records = [FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0) for i, pose in enumerate(drifted)]
     right, _ = told_again(truth)
     wrong, _ = told_again(truth, off=6.0)
-    run = MappingRun(None, None, state=state_of(drifted), back_end=end, records=records)
-    asking = replace(run, prior_query=lambda a, b: wrong(a, b) if a == 2 else right(a, b))
+    asked = lambda a, b: wrong(a, b) if a == 2 else right(a, b)  # noqa: E731
     with monkeypatch.context() as patch:
-        for module in (back_end.loops, loop_closing):
+        for module in (back_end.loops, integrate):
             patch.setattr(module, "consistent_loops", lambda end, since=0: list(end.verified))
-        end = finish_back_end(asking).back_end
+        end = finish_back_end(atlas_of(end, state_of(drifted)), asked).graph
     assert [one.a for one in end.accepted] == [1, 3, 4] and [refusal.a for refusal in end.refusals] == [2]
     assert end.accepted[0].sqrt_info[0, 0] > loops[0].sqrt_info[0, 0]
     assert error(end.poses, truth) < 0.5 * error(drifted, truth)
@@ -475,7 +471,7 @@ def test_what_moves_the_poses_was_asked_for_before(graph, monkeypatch):
     end = with_keyframes(walked(graph, drifted))
     end = replace(end, verified=[loop(truth, row) for row in range(1, 9)])
     assert len(consistent_loops(end)) == 8
-    end = finish_back_end(replace(run, back_end=end, prior_query=wrong)).back_end
+    end = finish_back_end(atlas_of(end, state_of(drifted)), wrong).graph
     assert end.accepted == [] and len(end.refusals) == 3 and consistent_loops(end) == []
     assert error(end.poses, drifted) == 0
 
@@ -487,25 +483,20 @@ def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_
     truth, drifted = ring(), ring(1.95 * np.pi)
     end = walked(graph, drifted)
     end = replace(end, verified=[loop(truth, row) for row in range(1, 9)] if has_loop else [])
-    records = [
-        FrameRecord(i, None, None, "tracked", pose=pose, scale=1.0, depth_noise=0.01 * (i % 3))
-        if i < COUNT // 3
-        else FrameRecord(i, None, None, "degraded", pose=pose, scale=1.0, depth_noise=9.0)  # fits nothing
-        for i, pose in enumerate(drifted)
-    ]
-    asked, config = [], SimpleNamespace(existence="gates")
-    run = MappingRun(None, config, state=state_of(drifted), records=records, back_end=end)
+    noise = [0.01 * (row % 3) if row < COUNT // 3 else 9.0 for row in range(COUNT)]
+    end = changed(end, depth_noise=noise, is_placed=[one < 9.0 for one in noise])  # the others fit nothing
+    asked, config = [], SimpleNamespace(existence="gates", submap=SimpleNamespace(map_capacity=COUNT))
 
     def settled(state, nodes, noise, gates):
         asked.append((noise, gates, nodes.T_world.as_matrix()[:COUNT]))
         return replace(state, time=jnp.asarray(-1))
 
-    monkeypatch.setattr(loop_closing, "merge_duplicates_of_state", settled)
-    run = finish_back_end(run)
+    monkeypatch.setattr(integrate, "merge_duplicates_of_state", settled)
+    atlas = finish_back_end(replace(atlas_of(end, state_of(drifted)), config=config))
     assert [one[:2] for one in asked] == ([(0.01, "gates")] if has_loop else [])
-    assert (run.state.time == -1) == has_loop
+    assert (atlas.state.time == -1) == has_loop
     for *_, poses in asked:
-        np.testing.assert_allclose(poses, run.back_end.poses, atol=1e-5)
+        np.testing.assert_allclose(poses, atlas.graph.poses, atol=1e-5)
 
 
 def test_a_gaussian_is_seen_from_the_node_of_its_birth(graph):

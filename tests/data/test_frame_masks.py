@@ -39,27 +39,6 @@ def test_what_is_black_or_of_a_class_is_left_out_with_a_border(tmp_path, image, 
     np.testing.assert_array_equal(is_out, np.indices((48, 64))[1] < columns)
 
 
-BAD = {
-    "none": (lambda path: Masks(f"{path}/nowhere").check(["a", "b"]), "nowhere has no mask for a .and 1 more"),
-    "turned": (lambda path: Masks(str(path)).read("a", (48, 64)), "is 64x48, but its image is 48x64; it is turned"),
-    "sides": (lambda path: Masks(str(path)).read("a", (64, 64)), "is 64x48, but its image is 64x64: make it"),
-    "no image": (lambda path: Masks(str(path)).read("b", (64, 64)), "b.png is"),
-    "no names": (lambda path: Masks(str(path), ["cat"]), "masks.names, the file that names the ids"),
-    "a class": (lambda path: Masks(str(path), ["dog"], f"{path}/names.txt"), "'dog'. are no classes of .* person, cat"),
-    "border": (lambda path: build_dataset(compose("masks.border=-1")), "masks.border"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_what_is_no_mask_is_named(tmp_path, case):
-    written(tmp_path, ["a"], KEPT)
-    (tmp_path / "b.png").write_bytes(b"none")
-    (tmp_path / "names.txt").write_text("7 person\n8 cat\n")
-    call, message = BAD[case]
-    with pytest.raises(ValueError, match=message):
-        call(tmp_path)
-
-
 def test_frames_and_predictions_have_nothing_there_and_the_image_stays(tmp_path):
     folder = written(tmp_path / "masks", [f"{number:06d}" for number in range(6)], KEPT)
     given, masked = compose(), compose(f"masks.folder={folder}", "masks.border=0")

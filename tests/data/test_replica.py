@@ -54,7 +54,7 @@ def test_missing_broken_or_foreign_calibration_names_the_file(replica_root):
     for content, message in (
         (whole[:-9], "must hold"),
         (whole.replace("120", "1"), ".* principal point outside of the 1x68 images"),
-        (whole.replace("6553.5", "-1"), ": scale must be raw units per metre .* got -1"),
+        (whole.replace("6553.5", "-1"), ": scale must be raw units per metre.* got -1"),
     ):
         path.write_text(content)
         with pytest.raises(ValueError, match=f"cam_params.json {message}".replace(" :", ":")):

@@ -26,8 +26,14 @@ def messages(
     P=P,
     name="raw",
     late=(0, 0, 0),
+    num_cut=0,
 ):
-    """(topic, type, message, nanoseconds of its arrival) of three images and a camera_info; `late`: of the images."""
+    """(topic, type, message, nanoseconds of its arrival) of three images and a camera_info.
+
+    Args:
+        late: nanoseconds by image.
+        num_cut: bytes that the second image lacks at its end.
+    """
     types = store.types
     extra = {"seq": 0} if version == 1 else {}
 
@@ -50,12 +56,12 @@ def messages(
             rows = pixels(image, encoding)
             padded = np.pad(rows, ((0, 0), (0, 4)))  # rows may be longer than the picture
             is_big = int(encoding == "mono16")
-            found = types["sensor_msgs/msg/Image"](
-                header, *SIZE[::-1], encoding, is_big, padded.shape[1], padded.ravel()
-            )
+            data = padded.ravel()[: padded.size - num_cut * (i == 1)]
+            found = types["sensor_msgs/msg/Image"](header, *SIZE[::-1], encoding, is_big, padded.shape[1], data)
             yield f"/cam/image_{name}", "sensor_msgs/msg/Image", found, arrival
         else:
             data = cv2.imencode(".png", image)[1].ravel()
+            data = data[: data.size - num_cut * (i == 1)]
             found = types["sensor_msgs/msg/CompressedImage"](header, "png", data)
             yield f"/cam/image_{name}/compressed", "sensor_msgs/msg/CompressedImage", found, arrival
 
@@ -67,12 +73,14 @@ def pixels(image, encoding):
     return (image[..., 1] if encoding.endswith("C1") else image).reshape(len(image), -1)
 
 
-def write_bag(folder, version=2, kind="Image", **options):
+def write_bag(folder, version=2, kind="Image", others=(), **options):
+    """A bag with the `messages` of these options, and without a camera of each of `others`."""
     store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
     path = folder / ("walk.bag" if version == 1 else "walk")
     topics = {}
     with Writer1(path) if version == 1 else Writer2(path, version=9) as bag:
-        for topic, msgtype, message, time in messages(store, version, kind, **options):
+        more = [one for other in others for one in messages(store, version, kind, info=False, **other)]
+        for topic, msgtype, message, time in [*messages(store, version, kind, **options), *more]:
             if topic not in topics:
                 topics[topic] = bag.add_connection(topic, msgtype, typestore=store)
             encode = store.serialize_ros1 if version == 1 else store.serialize_cdr

@@ -8,8 +8,8 @@ from emgs_jax.data.class_file import ClassFile
 from emgs_jax.evaluation import segmentation
 from emgs_jax.evaluation.segmentation import (
     DistinctCells,
-    LabelGrid,
     LabelledPoints,
+    SpooledLabels,
     compare_labels,
     confusion_matrix,
     label_cells,
@@ -139,16 +139,17 @@ def test_classes_are_compared_by_their_names_and_one_that_the_truth_lacks_is_wro
 
 
 def test_the_class_of_a_voxel_is_that_of_most_views_and_a_view_counts_once(monkeypatch):
-    monkeypatch.setattr("emgs_jax.evaluation.segmentation._MERGE_ROWS", 2)  # merges on the way
-    grid, here, there = LabelGrid(0.1), [0.05, 0.05, 0.05], [-0.05, 0.05, 0.25]
-    grid.add(np.array([here, here, here, there]), np.array([2, 2, 2, 0]))
+    seen, here, there = SpooledLabels(("a", "b", "c")), [0.05, 0.05, 0.05], [-0.05, 0.05, 0.25]
+    seen.append(np.array([here, here, here, there]), np.array([2, 2, 2, 0]))
     for labels in ([1, -1], [1, 0]):
-        grid.add(np.array([here, there]), np.array(labels))
-    grid.add(np.array([here, [np.nan, 0, 0]]), np.array([0, 0]))
-    found = grid.points(("a", "b", "c"))
-    np.testing.assert_allclose(found.points, [there, here])  # by cell
-    np.testing.assert_array_equal(found.labels, [0, 1])
-    assert found.classes == ("a", "b", "c") and len(LabelGrid(0.1).points(("a",)).labels) == 0
+        seen.append(np.array([here, there]), np.array(labels))
+    seen.append(np.array([here, [np.nan, 0, 0]]), np.array([0, 0]))
+    for most in (500_000, 2):  # all cells together, or each by itself
+        monkeypatch.setattr("emgs_jax.evaluation.clouds._PART_ROWS", most)
+        found = seen.points(0.1)
+        np.testing.assert_allclose(found.points, [there, here])  # by cell
+        np.testing.assert_array_equal(found.labels, [0, 1])
+    assert found.classes == ("a", "b", "c") and len(SpooledLabels(("a",)).points(0.1).labels) == 0
 
 
 def test_labels_are_translated_by_name_and_the_nearest_class_is_by_angle():

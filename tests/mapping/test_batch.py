@@ -6,9 +6,11 @@ import pytest
 from scene import at, first_window, observe_room, path_pose, predict_room, slam_config, stack_poses
 from tiny_run import EditedPrior, dataset
 
+from emgs_jax.back_end.state import BackEnd
 from emgs_jax.data.base import Frame
+from emgs_jax.mapping.atlas import Atlas
 from emgs_jax.mapping.batch import integrate_stack, make_stack, map_together, programs, unstacked
-from emgs_jax.mapping.pipeline import integrate
+from emgs_jax.mapping.pipeline import map_input
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.mapping.window_input import RawView, WindowInput
 from emgs_jax.ops.pytree import stack
@@ -64,11 +66,14 @@ def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_
             for size in (128, 512)
         )
     )
-    together, alone = ([MappingRun(camera, config) for config in some] for some in (configs, roomy))
+    together, alone = (
+        [MappingRun(Atlas(camera, config, BackEnd(None, (1.0, 1.0, 0.0, 0.0), 0.0))) for config in some]
+        for some in (configs, roomy)
+    )
     stacked = make_stack(together)
     for given in sequence:
         stacked = integrate_stack(stacked, given)
-        alone = [integrate(run, given)[0] for run in alone]
+        alone = [map_input(run, given)[0] for run in alone]
     for mine, run in zip(unstacked(stacked), alone, strict=True):
         count = int(run.map.gaussians.valid.sum())
         assert int(mine.map.gaussians.valid.sum()) == count and mine.map.weight.shape == (512,)
@@ -87,4 +92,10 @@ def test_configs_share_a_program_where_only_traced_leaves_differ(camera):
     configs.append(at(base, "observation.min_confidence", 2.0))
     assert programs(configs) == [[0, 1, 3], [2], [4]]
     with pytest.raises(ValueError, match="programs"):
-        next(map_together([MappingRun(camera, config) for config in configs], dataset(), EditedPrior()))
+        next(
+            map_together(
+                [MappingRun(Atlas(camera, config, BackEnd(None, (1.0, 1.0, 0.0, 0.0), 0.0))) for config in configs],
+                dataset(),
+                EditedPrior(),
+            )
+        )

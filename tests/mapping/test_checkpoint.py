@@ -2,22 +2,29 @@
 
 import contextlib
 import itertools
+import json
 import os
 import signal
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from tempfile import mkdtemp
 
 import jax.numpy as jnp
+import jaxlie
 import numpy as np
 import pytest
 from own_process import begin, ended, wait_for
+from scene import assert_same, random_observation
 from tiny_run import NUM_FRAMES, TINY, compose
 
 import experiments.run
+from emgs_jax.back_end.state import BackEnd, Node, Refusal
+from emgs_jax.gaussian_map import empty_map
 from emgs_jax.io.files import changes
 from emgs_jax.io.trajectory import load_trajectory_tum
-from emgs_jax.mapping import pipeline
+from emgs_jax.mapping import integrate
+from emgs_jax.mapping.atlas import Atlas, Submap
 from emgs_jax.mapping.checkpoint import (
     CHECKPOINT_FILE,
     Checkpoint,
@@ -27,6 +34,9 @@ from emgs_jax.mapping.checkpoint import (
     save_checkpoint,
 )
 from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.mapping.world import World
+from emgs_jax.registration.pose_estimate import exact_estimate
+from emgs_jax.slam import SlamState
 from tools.kills.folders import log_lines
 
 # Strict gates, so that the map outgrows half the capacity of tiny_run, and has the shapes of its runs then.
@@ -43,7 +53,7 @@ class Stopped(BaseException):
 @contextlib.contextmanager
 def in_step(number: int, is_killed: bool, monkeypatch):
     """At this step; who is killed writes nothing any more."""
-    steps, advance = itertools.count(), pipeline.advance
+    steps, advance = itertools.count(), integrate.advance
 
     def counted(*arguments):
         if next(steps) == number:
@@ -53,7 +63,7 @@ def in_step(number: int, is_killed: bool, monkeypatch):
         return advance(*arguments)
 
     with monkeypatch.context() as patch, pytest.raises(Stopped):
-        patch.setattr(pipeline, "advance", counted)
+        patch.setattr(integrate, "advance", counted)
         yield
 
 
@@ -88,9 +98,9 @@ def whole(*more):
 
 def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) -> None:
     """The same command takes so many steps, and comes to what the run that nobody stopped has."""
-    steps, advance = [], pipeline.advance
+    steps, advance = [], integrate.advance
     with monkeypatch.context() as patch:
-        patch.setattr(pipeline, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
+        patch.setattr(integrate, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
         found = experiments.run.run(compose(*OVERRIDES, *more), folder)
     assert len(steps) in num_steps, "the steps before are not repeated"
     expected, metrics = whole(*more)
@@ -132,7 +142,9 @@ def test_a_run_that_is_stopped_where_its_predictions_are_gathered_has_written_it
     with in_gathering(NUM_FRAMES - 1, monkeypatch):
         experiments.run.run(compose(*OVERRIDES, *GRAPH), tmp_path)
     with np.load(tmp_path / CHECKPOINT_FILE) as file:
-        placed = file["pose"][:, :3, 3]  # as the frames were placed
+        signature = json.loads(str(file["__header__"]))["signature"]
+    records = load_checkpoint(tmp_path / CHECKPOINT_FILE, signature).records
+    placed = np.stack([record.pose[:3, 3] for record in records])  # as the frames were placed
     _, written = load_trajectory_tum(tmp_path / "trajectory.txt")
     factors = np.linalg.norm(np.diff(written[:, :3, 3], axis=0), axis=1) / np.linalg.norm(
         np.diff(placed, axis=0), axis=1
@@ -152,8 +164,8 @@ def test_a_scheduler_ends_a_run_with_one_word_and_the_same_command_goes_on(tmp_p
     assert ended(program) == 128 + signal.SIGTERM, said.read_text()
     assert "terminated\n" in said.read_text() and "Traceback" not in said.read_text()
     assert f"the same command with hydra.run.dir={folder} goes on" in said.read_text()
-    steps, advance = [], pipeline.advance
-    monkeypatch.setattr(pipeline, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
+    steps, advance = [], integrate.advance
+    monkeypatch.setattr(integrate, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
     experiments.run.run(compose(*OVERRIDES), folder)
     assert len(steps) < NUM_FRAMES - 1, "in another process"
     for name in ("map.npz", "trajectory.txt"):
@@ -181,17 +193,25 @@ def checkpoint() -> Checkpoint:
     records = [FrameRecord(0, "a", 0.1, "initialization", pose=pose, raw_pose=pose, num_gaussians=3, seconds=1 / 3)]
     records += [FrameRecord(1, None, None, "lost", reason="why", pose=pose, residual=float("nan"))]
     records += [FrameRecord(2, "c", 0.3, "tracked", pose=pose, covariance=np.arange(36.0).reshape(6, 6) / 7)]
-    return Checkpoint(2, [np.float32([0.1, 0.2]), jnp.asarray([True])], (64, 32), records)
+    state = SlamState(empty_map(4, 2), random_observation(3), jaxlie.SE3.identity(), exact_estimate(), jnp.asarray(2))
+    end = BackEnd(None, (1.0, 1.0, 0.5, 0.5), 0.01, nodes=(Node(pose, pose, 0.1, 0),), queries={(0, 1): "silent"})
+    end = replace(end, refusals=(Refusal(0, 1, "matches", float("nan")),), active=1)
+    return Checkpoint(2, Atlas(None, None, end, {1: Submap(state)}, World(2, pose, pose)), (64, 32), tuple(records))
 
 
 def test_what_is_read_is_what_was_written(tmp_path):
     save_checkpoint(tmp_path / "c.npz", checkpoint(), {"a": 1})
     found, wrote = load_checkpoint(tmp_path / "c.npz", {"a": 1}), checkpoint()
     assert (found.num_inputs, found.capacities) == (2, (64, 32))
-    for one, other in zip(found.leaves, wrote.leaves, strict=True):
-        assert one.dtype == other.dtype and one.tobytes() == np.asarray(other).tobytes()
-    for one, other in zip(found.records, wrote.records, strict=True):
+    assert_same(found.atlas.state, wrote.atlas.state)
+    for one, other in (
+        *zip(found.records, wrote.records, strict=True),
+        (found.atlas.world, wrote.atlas.world),
+        *zip(found.atlas.graph.nodes, wrote.atlas.graph.nodes, strict=True),
+    ):
         np.testing.assert_equal(vars(one), vars(other))
+    assert found.atlas.graph.queries == wrote.atlas.graph.queries and found.atlas.graph.active == 1
+    np.testing.assert_equal(found.atlas.graph.refusals, wrote.atlas.graph.refusals)
 
 
 @pytest.mark.parametrize("length", [0, 10, 400, -20])

@@ -1,15 +1,17 @@
 """The covariance of a pose relative to the first frame: against samples of the errors of a walk that comes back."""
 
-from types import SimpleNamespace
+from dataclasses import replace
 
 import jaxlie
 import numpy as np
 import pytest
+from hand_run import atlas_of
 from scene import on_host, pose
 
+from emgs_jax.back_end.state import BackEnd
 from emgs_jax.geometry import seen_from
+from emgs_jax.mapping.integrate import covariance_of_map
 from emgs_jax.mapping.records import FrameRecord
-from emgs_jax.mapping.run import MappingRun, covariance_of_map
 from tools.nees.consistency import nees, pose_errors
 
 COUNT, NUM_DRAWS = 12, 4000
@@ -25,21 +27,22 @@ def walk() -> np.ndarray:
     )  # fmt: skip
 
 
-def mapped(origins=ORIGINS) -> MappingRun:
-    run = MappingRun(None, None)
+def mapped(origins=ORIGINS) -> list[FrameRecord]:
+    records = []
     for row, (T, origin) in enumerate(zip(walk(), origins, strict=True)):
-        if row == 0:
-            record = FrameRecord(row, None, None, "initialization", pose=T)
-        else:
-            covariance = OWN + covariance_of_map(run, T, origin)
-            record = FrameRecord(row, None, None, "tracked", pose=T, covariance=covariance, origin=origin)
-        run = MappingRun(None, None, records=(*run.records, record))
-    return run
+        covariance = None if row == 0 else OWN + covariance_of_map(graph_of(records), T, origin)
+        status = "tracked" if row else "initialization"
+        records.append(FrameRecord(row, None, None, status, pose=T, covariance=covariance, origin=origin))
+    return records
+
+
+def graph_of(records) -> BackEnd:
+    return atlas_of(records).graph
 
 
 def test_errors_that_add_up_from_origin_to_origin_have_the_covariance_that_is_said():
     """Each frame errs relative to where the frame really was whose part of the map it was placed in."""
-    poses, records, rng = walk(), mapped().records, np.random.default_rng(0)
+    poses, records, rng = walk(), mapped(), np.random.default_rng(0)
     true = np.empty((COUNT, NUM_DRAWS, 4, 4))
     true[0] = poses[0]
     exp = on_host(lambda xi: jaxlie.SE3.exp(xi).as_matrix())
@@ -56,29 +59,19 @@ def test_errors_that_add_up_from_origin_to_origin_have_the_covariance_that_is_sa
 
 def test_a_frame_that_nothing_explains_has_the_origin_of_the_frame_before():
     """Not tracked, or tracked and all it sees is new: its origin is its own number then."""
-    before = MappingRun(None, None, records=mapped().records[:9])
-    T, there = walk()[9], before.records[7]  # of the frame before, 8
+    before = graph_of(mapped()[:9])
+    T, there = walk()[9], before.nodes[7]  # of the frame before, 8
     expected = seen_from(there.covariance, there.pose, T[None])[0]
     for origin in (None, 9):
         np.testing.assert_array_equal(covariance_of_map(before, T, origin), expected)
-    first = MappingRun(None, None, records=mapped().records[:1])
-    np.testing.assert_array_equal(covariance_of_map(first, walk()[1], None), np.zeros((6, 6)))
-
-
-def test_frames_are_counted_from_the_first_one_in_the_map():
-    lost = [FrameRecord(row, None, None, "lost", pose=np.eye(4)) for row in range(3)]
-    run, T = mapped(), walk()[5]
-    later = MappingRun(None, None, records=(*lost, *run.records))
-    np.testing.assert_array_equal(covariance_of_map(later, T, 4), covariance_of_map(run, T, 4))
+    np.testing.assert_array_equal(covariance_of_map(graph_of(mapped()[:1]), walk()[1], None), np.zeros((6, 6)))
 
 
 def test_a_saved_map_is_exact_and_what_a_run_adds_to_it_is_not():
-    """Of 20 frames; two are lost before the camera is found, and then four are nodes."""
-    end = SimpleNamespace(first_node=20, nodes=[None] * 24)
-    lost = [FrameRecord(row, None, None, "lost", pose=np.eye(4)) for row in range(2)]
-    run = MappingRun(None, None, records=(*lost, *mapped().records[1:5]), saved=object(), back_end=end)
-    there, T = run.records[3], walk()[6]
+    """Of 20 frames."""
+    saved, added = ([replace(one, covariance=None, origin=None) for one in mapped()] * 2)[:20], mapped()[1:5]
+    graph, T = graph_of([*saved, *added]), walk()[6]
     for origin in (0, 19):
-        np.testing.assert_array_equal(covariance_of_map(run, T, origin), np.zeros((6, 6)))
-    expected = seen_from(there.covariance, there.pose, T[None])[0]
-    np.testing.assert_array_equal(covariance_of_map(run, T, 21), expected)
+        np.testing.assert_array_equal(covariance_of_map(graph, T, origin), np.zeros((6, 6)))
+    expected = seen_from(added[1].covariance, added[1].pose, T[None])[0]
+    np.testing.assert_array_equal(covariance_of_map(graph, T, 21), expected)

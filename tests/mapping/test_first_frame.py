@@ -8,10 +8,12 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from hand_run import run_of
 from scene import pose, random_gaussians, random_observation, slam_config
 
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.mapping.finalize import own_covariance, with_first_frame
+from emgs_jax.mapping.pipeline import with_atlas
 from emgs_jax.mapping.records import FrameRecord, to_line
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.observation import transform
@@ -35,7 +37,12 @@ def a_run(count: float = COUNT, shared: float = 0.75) -> MappingRun:
     map = new_map(random_gaussians(9), jnp.ones(9), jnp.ones(()), jnp.asarray(0))
     seen = transform(last, random_observation(20), jnp.ones(()))
     state = SlamState(map, seen, last, estimate, jnp.asarray(3))
-    return MappingRun(None, slam_config(f"slam.localization.pose_shared={shared}"), state=state, records=records)
+    return run_of(records, state, slam_config(f"slam.localization.pose_shared={shared}"))
+
+
+def ended(run: MappingRun) -> MappingRun:
+    atlas, own = with_first_frame(run.atlas, run.records[0].pose)
+    return replace(with_atlas(run, atlas), first_covariance=own)
 
 
 def test_the_first_frame_is_as_uncertain_as_half_a_window_of_motions_turned_out_to_be():
@@ -50,14 +57,14 @@ def test_the_first_frame_is_as_uncertain_as_half_a_window_of_motions_turned_out_
 @pytest.mark.parametrize("settings", [{"count": 0.0}, {"shared": 1.0}])
 def test_where_answers_say_nothing_of_each_other_nothing_is_added(settings):
     run = a_run(**settings)
-    assert with_first_frame(run) is run
+    assert with_first_frame(run.atlas, np.eye(4)) == (run.atlas, None)
 
 
 def test_what_is_added_is_the_scatter_of_the_poses_relative_to_a_first_frame_that_is_off():
     run, rng = a_run(), np.random.default_rng(0)
     own, first = own_covariance(run.state, run.config.localization), run.records[0].pose
     before = [record.covariance for record in run.records]
-    run = with_first_frame(run)
+    run = ended(run)
     assert run.records[0].covariance is None, "the first frame itself has none"
     draws = jaxlie.SE3.exp(jnp.asarray(rng.multivariate_normal(np.zeros(6), own, 4000), jnp.float32)).as_matrix()
     for row in (1, 2):
@@ -71,11 +78,12 @@ def test_what_is_added_is_the_scatter_of_the_poses_relative_to_a_first_frame_tha
 def test_the_file_of_the_frames_says_it_too(tmp_path):
     run = a_run()
     records = [replace(record, timestamp=0.1 * record.index) for record in run.records]
-    run = replace(run, records=(*records, FrameRecord(3, None, 0.3, "lost", pose=records[-1].pose)))
+    lost = FrameRecord(3, None, 0.3, "lost", pose=records[-1].pose)
+    run = run_of((*records, lost), run.state, run.config)
     lines = [json.dumps(to_line(record), default=np.ndarray.tolist) for record in run.records]
     skipped = json.dumps(to_line(FrameRecord(9, None, None, "skipped")))
     (tmp_path / "frames.jsonl").write_text("\n".join([skipped, *lines]) + "\n")
-    run = with_first_frame(run)
+    run = ended(run)
     save_progress(tmp_path, run)
     found = [json.loads(line) for line in (tmp_path / "frames.jsonl").read_text().splitlines()]
     assert found[0]["status"] == "skipped" and found[-1]["covariance"] is None
@@ -85,5 +93,6 @@ def test_the_file_of_the_frames_says_it_too(tmp_path):
 
 
 def test_poses_in_a_saved_map_are_not_relative_to_a_first_frame():
-    run = replace(a_run(), saved=object())
-    assert with_first_frame(run) is run
+    atlas = a_run().atlas
+    atlas = replace(atlas, graph=replace(atlas.graph, first_node=1))
+    assert with_first_frame(atlas, np.eye(4)) == (atlas, None)

@@ -18,20 +18,10 @@ from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.localization import localize_coarse
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
-from emgs_jax.mapping.records import RELOCALIZED, FrameRecord
-from emgs_jax.mapping.relocalization import (
-    anchor_motion,
-    anchor_motion_of,
-    as_step_prediction,
-    is_relocalization_due,
-    is_restart_due,
-    move_prediction,
-    reanchor_prior,
-    rejection,
-    relocalized_start,
-    with_saved_map,
-)
-from emgs_jax.mapping.run import MappingRun, new_run
+from emgs_jax.mapping.atlas import Atlas, Submap, rejection, relocalized_start, unvisited, with_state
+from emgs_jax.mapping.integrate import is_relocalization_due, is_restart_due
+from emgs_jax.mapping.run import new_run
+from emgs_jax.mapping.world import World, anchor_motion, anchor_world, as_step_prediction, move_prediction
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.pose_estimate import exact_estimate
@@ -62,11 +52,11 @@ def some_map():
     return new_map(random_gaussians(30), jnp.ones(30), jnp.ones(()), jnp.asarray(0, jnp.int32))
 
 
-def run(state: SlamState | None = None, saved_map=None, **more) -> SimpleNamespace:
-    config = load_config("graph=default")
-    end = SimpleNamespace(nodes=[None] * 7, config=config.graph)
-    saved = None if saved_map is None else SimpleNamespace(map=saved_map, back_end=end, depth_noise=0.02)
-    return SimpleNamespace(**{"config": config.slam, "state": state, "saved": saved, "back_end": end} | more)
+def saved(map) -> Submap:
+    """A saved map of seven frames, before one is found in it."""
+    end = SimpleNamespace(nodes=[None] * 7)
+    one = SimpleNamespace(map=map, back_end=end, depth_noise=0.02, is_fixed=False)
+    return unvisited(one, CAMERA, load_config().slam)
 
 
 def lost_state() -> SlamState:
@@ -80,7 +70,7 @@ def lost_state() -> SlamState:
 def test_the_coarse_pose_of_the_step_is_where_the_camera_was_found(coarse):
     """By every reading: the frame before is this one, and the prior's world is moved to it."""
     config = load_config(f"slam.localization.coarse={coarse}").slam.localization
-    state, again = relocalized_start(run(lost_state()), prediction(), FOUND_THERE)
+    state, again = relocalized_start(lost_state(), prediction(), FOUND_THERE)
     last = state.previous, state.T_world_previous
     pose = localized(again, *last, CAMERA, config, state.estimate)
     np.testing.assert_allclose(pose.T_world_camera.as_matrix(), PLACE, atol=1e-4)
@@ -93,7 +83,7 @@ def test_the_coarse_pose_of_the_step_is_where_the_camera_was_found(coarse):
 
 def test_map_unit_and_time_of_a_lost_run_go_on():
     before = lost_state()
-    state, again = relocalized_start(run(before), prediction(), FOUND_THERE)
+    state, again = relocalized_start(before, prediction(), FOUND_THERE)
     assert_same(state.map, before.map)
     assert not again.is_repeat  # it is its own previous frame
     assert int(state.time) == 12 and float(state.estimate.num_scales) == 9
@@ -102,7 +92,7 @@ def test_map_unit_and_time_of_a_lost_run_go_on():
 
 
 def test_in_a_saved_map_the_unit_is_what_the_first_frame_found_says():
-    state, _ = relocalized_start(run(saved_map=some_map()), prediction(), FOUND_THERE)
+    state, _ = relocalized_start(saved(some_map()).state, prediction(), FOUND_THERE, is_same_unit=False)
     assert_same(state.map, some_map())
     assert int(state.time) == 7 and float(state.estimate.num_scales) == 1
     np.testing.assert_allclose([state.estimate.log_scale, state.estimate.depth_noise], [np.log(1.1), 0.02], rtol=1e-6)
@@ -111,7 +101,7 @@ def test_in_a_saved_map_the_unit_is_what_the_first_frame_found_says():
 def test_features_of_another_width_are_refused():
     wide = new_map(random_gaussians(30, num_features=8), jnp.ones(30), jnp.ones(()), jnp.asarray(0, jnp.int32))
     with pytest.raises(ValueError, match=r"width 8 and those of this run 0: use prior= and features="):
-        relocalized_start(run(saved_map=wide), prediction(), FOUND_THERE)
+        relocalized_start(saved(wide).state, prediction(), FOUND_THERE)
 
 
 def test_from_then_on_the_prior_says_its_poses_from_where_the_camera_was_found():
@@ -126,19 +116,17 @@ def test_from_then_on_the_prior_says_its_poses_from_where_the_camera_was_found()
     np.testing.assert_allclose(anchor @ relative, PLACE, atol=1e-5)
     assert move_prediction(given, None) is given
     assert np.isnan(there.pose_covariance).all()  # that world is only as sure as the pose that was found
-    record = FrameRecord(0, None, None, "tracked", pose=PLACE, scale=1.1)
-    np.testing.assert_allclose(anchor_motion_of(record, given).wxyz_xyz, motion.wxyz_xyz, atol=1e-6)
+    anchored = anchor_world(World(), SimpleNamespace(structure=0, prediction=given), PLACE, 1.1)
+    np.testing.assert_allclose(anchored.motion.wxyz_xyz, motion.wxyz_xyz, atol=1e-6)
 
 
 def test_a_frame_of_its_own_is_where_the_camera_was_found_and_goes_with_it_from_then_on():
     own = matrix((0, 40, 0), (1, 2, 3))
-    record = FrameRecord(0, None, None, "tracked", pose=PLACE, scale=1.1, location=RELOCALIZED)
-    session = MappingRun(None, None, records=(record,))
     given = SimpleNamespace(structure=2, frames=[SimpleNamespace(index=5)], T_anchor_views={5: own})
-    session = reanchor_prior(session, given)
-    np.testing.assert_allclose(session.structure.T_world_structure @ own, PLACE, atol=1e-12)
-    assert session.structure.number == 2
-    np.testing.assert_allclose(session.prior_motion.as_matrix(), np.eye(4))  # None would stay behind in a closure
+    world = anchor_world(World(), given, PLACE, 1.1)
+    np.testing.assert_allclose(world.T_world_structure @ own, PLACE, atol=1e-12)
+    assert world.number == 2
+    np.testing.assert_allclose(world.motion.as_matrix(), np.eye(4))  # None would stay behind in a closure
 
 
 def test_the_first_view_of_a_sequence_is_its_own_previous_one():
@@ -151,22 +139,16 @@ def test_the_first_view_of_a_sequence_is_its_own_previous_one():
 
 
 @pytest.mark.parametrize(
-    ("statuses", "is_tracked", "expected"),
-    [
-        (["tracked", "degraded", "lost"], False, True),  # the third in a row
-        (["tracked", "degraded", "lost"], True, False),
-        (["degraded", "tracked", "lost"], False, False),
-        (["initialization", "lost"], False, False),
-    ],
+    ("num_lost", "is_tracked", "expected"),
+    [(2, False, True), (2, True, False), (1, False, False)],  # the third in a row
 )
-def test_a_camera_is_looked_for_after_some_frames_that_are_not_tracked(statuses, is_tracked, expected):
+def test_a_camera_is_looked_for_after_some_frames_that_are_not_tracked(num_lost, is_tracked, expected):
     info = SimpleNamespace(localization=SimpleNamespace(is_tracked=is_tracked))
-    records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]
-    assert is_relocalization_due(run(lost_state(), records=records), info) == expected
-    assert is_relocalization_due(run(saved_map=some_map(), records=[]), None)
-    without = run(lost_state(), records=records)
-    without.back_end = None
-    assert not is_relocalization_due(without, info)
+    end = SimpleNamespace(config=load_config("graph=default").graph)
+    assert is_relocalization_due(Atlas(None, None, end, {0: None}, num_lost=num_lost), info) == expected
+    assert is_relocalization_due(Atlas(None, None, end, {0: saved(some_map())}), None)
+    assert not is_relocalization_due(Atlas(None, None, end), None), "there is no map yet"
+    assert not is_relocalization_due(Atlas(None, None, SimpleNamespace(config=None), {0: None}, num_lost=9), info)
 
 
 def begins_anew(
@@ -179,14 +161,12 @@ def begins_anew(
         nodes=[SimpleNamespace(is_placed=row < 3) for row in range(7)], config=config.graph, first_node=0
     )
     end.factors = [SimpleNamespace(a=a, b=b, is_loop=False) for a, b in chain]
-    statuses = ["initialization", "tracked", "tracked", *["degraded"] * 4]
-    records = [FrameRecord(row, None, None, status) for row, status in enumerate(statuses)]
     found = SimpleNamespace(is_tracked=False, repeat_rms=repeat_rms)
     state = lost_state()
     state = eqx.tree_at(lambda s: s.previous.valid, state, state.previous.valid & has_points)
     given = SimpleNamespace(frames=[SimpleNamespace(index=7)], T_anchor_views={view: poses[view] for view in here})
     return is_restart_due(
-        SimpleNamespace(back_end=end, records=records, is_fixed=is_fixed, config=config.slam),
+        SimpleNamespace(graph=end, num_lost=4, is_frozen=is_fixed, config=config.slam),
         given,
         state,
         SimpleNamespace(localization=found),
@@ -240,9 +220,10 @@ def test_a_first_window_as_a_whole_has_no_place_in_a_saved_map():
 
 def test_a_map_that_stays_gets_the_room_of_the_others_and_keeps_its_rows():
     state = lost_state()
-    run = MappingRun(None, None, state=state, saved=SimpleNamespace(map=state.map))
+    before = Atlas(None, None, SimpleNamespace(active=0), {0: Submap(state, is_frozen=True)})
     configs = [SimpleNamespace(submap=SimpleNamespace(map_capacity=capacity)) for capacity in (30, 64)]
-    same, larger = (with_saved_map(replace(run, config=config)).map for config in configs)
+    other = replace(state, map=some_map(), time=jnp.asarray(13))
+    same, larger = (with_state(before, other, config).state.map for config in configs)
     assert_same(same, state.map)
     assert larger.weight.shape == (64,) and int(larger.gaussians.valid.sum()) == 30
     assert_same(jax.tree.map(lambda leaf: leaf[:30], larger), state.map)

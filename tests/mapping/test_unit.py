@@ -5,10 +5,12 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
+from hand_run import run_of
 from scene import assert_same, pose, random_gaussians, random_observation
 
 from emgs_jax.gaussian_map import new_map
-from emgs_jax.mapping.finalize import rescale_run, rescaled
+from emgs_jax.mapping.finalize import rescale_atlas, rescaled
+from emgs_jax.mapping.pipeline import with_atlas
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.registration.pose_estimate import exact_estimate
@@ -24,7 +26,7 @@ def a_run(log_scale: float) -> MappingRun:
     ]
     records = [FrameRecord(0, None, None, "initialization", pose=poses[0], scale=1.0)]
     known = {"scale": 0.9, "covariance": np.eye(6)}
-    records += [FrameRecord(i, None, None, "tracked", pose=poses[i], newest_pose=poses[i], **known) for i in (1, 2)]
+    records += [FrameRecord(i, None, None, "tracked", pose=poses[i], **known) for i in (1, 2)]
     known = (
         jnp.asarray(log_scale),
         jnp.eye(7),
@@ -33,15 +35,17 @@ def a_run(log_scale: float) -> MappingRun:
     estimate = eqx.tree_at(lambda b: (b.log_scale, b.covariance, b.repeats.predicted), exact_estimate(), known)
     map = new_map(random_gaussians(9), jnp.ones(9), jnp.ones(()), jnp.asarray(0))
     last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))
-    return MappingRun(
-        None, None, state=SlamState(map, random_observation(20), last, estimate, jnp.asarray(3)), records=records
-    )
+    return run_of(records, SlamState(map, random_observation(20), last, estimate, jnp.asarray(3)))
+
+
+def in_unit(run: MappingRun) -> MappingRun:
+    return with_atlas(run, rescale_atlas(run.atlas, run.records[0].pose))
 
 
 def test_all_lengths_grow_about_the_first_camera_and_directions_stay():
     run, factor = a_run(LOG_SCALE), np.exp(-LOG_SCALE)
     before, records = run.state, run.records
-    run = rescale_run(run)
+    run = in_unit(run)
     after, origin = run.state, records[0].pose[:3, 3]
     grown = origin + factor * (np.asarray(before.map.gaussians.means) - origin)
     np.testing.assert_allclose(after.map.gaussians.means, grown, atol=1e-5)
@@ -52,7 +56,6 @@ def test_all_lengths_grow_about_the_first_camera_and_directions_stay():
         np.testing.assert_allclose(new.pose[:3, 3], origin + factor * (old.pose[:3, 3] - origin), atol=1e-12)
         np.testing.assert_array_equal(new.pose[:3, :3], old.pose[:3, :3])
     assert run.records[1].scale == pytest.approx(0.9 * factor) and run.records[0].scale == pytest.approx(factor)
-    np.testing.assert_allclose(run.records[2].newest_pose, run.records[2].pose)
     np.testing.assert_allclose(after.T_world_previous.as_matrix(), run.records[2].pose, atol=1e-5)
     np.testing.assert_allclose(np.sqrt(np.diag(after.estimate.covariance)), [factor] * 3 + [1.0] * 4, rtol=1e-5)
     np.testing.assert_allclose(np.sqrt(np.diag(run.records[1].covariance)), [factor] * 3 + [1.0] * 3, rtol=1e-7)
@@ -65,7 +68,7 @@ def test_all_lengths_grow_about_the_first_camera_and_directions_stay():
 def test_a_point_keeps_its_pixel_in_every_view():
     run = a_run(LOG_SCALE)
     means, poses = np.asarray(run.state.map.gaussians.means), run.poses
-    run = rescale_run(run)
+    run = in_unit(run)
 
     def rays(points: np.ndarray, T: np.ndarray) -> np.ndarray:
         seen = (points - T[:3, 3]) @ T[:3, :3]
@@ -79,9 +82,8 @@ def test_a_point_keeps_its_pixel_in_every_view():
 
 def test_a_map_in_the_priors_own_unit_keeps_every_bit():
     run = a_run(0.0)
-    assert rescale_run(run) is run
-    empty = MappingRun(None, None)
-    assert rescale_run(empty) is empty  # nothing was mapped
+    for atlas in (run.atlas, run_of(()).atlas):  # nothing was mapped
+        assert rescale_atlas(atlas, np.eye(4)) is atlas
 
 
 def test_there_and_back_is_the_same():

@@ -190,20 +190,6 @@ def test_another_sequence_window_size_window_or_calibration_is_refused_by_name(f
             replay.check(other, WINDOW_SIZE)
 
 
-def test_missing_and_foreign_folders_name_the_path(tmp_path, folder):
-    with pytest.raises(ValueError, match="nowhere.*manifest.json is missing"):
-        Recorded(tmp_path / "nowhere")
-    manifest = json.loads((folder / "manifest.json").read_text())
-    for content, message in (
-        (manifest | {"version": 4}, r"version 4, this program reads \(1, 2, 3\)"),
-        (manifest | {"format": "other"}, "not of the format"),
-        ([1, 2], "not of the format"),
-    ):
-        (folder / "manifest.json").write_text(json.dumps(content))
-        with pytest.raises(ValueError, match=message):
-            Recorded(folder)
-
-
 def damaged(content, seed):
     """Yield 60 versions of `content`: cut short, with one flipped bit, with a run of random bytes."""
     rng = np.random.default_rng(seed)

@@ -85,9 +85,7 @@ def test_a_file_that_is_no_baseline_is_refused_with_a_remedy(tmp_path, content):
         read_gate(tmp_path / "gate.yaml")
 
 
-def test_a_baseline_that_is_not_there_or_of_nothing_is_refused(tmp_path):
-    with pytest.raises(ValueError, match=r"missing.yaml is no file.*write_gate=FILE"):
-        read_gate(tmp_path / "missing.yaml")
+def test_a_baseline_of_nothing_is_refused(tmp_path):
     with pytest.raises(ValueError, match="no result of ours"):
         write_gate(tmp_path / "new.yaml", [], TOLERANCES)
 
@@ -107,9 +105,3 @@ def test_tolerances_are_four_deviations_of_what_rounding_does_to_the_mean_of_the
     found = rounding_tolerances(TOLERANCES, [*noise, *first], [*reversed(again), *noise[:6]], num_seeds=4)
     assert found == {ATE: {"direction": "lower", "tolerance": 0.04}, F1: TOLERANCES[F1]}
     assert rounding_tolerances(TOLERANCES, first, first, 4) == TOLERANCES
-
-
-def test_tolerances_of_a_few_results_are_refused():
-    first = estimates([1.0] * 9, [50.0] * 9)
-    with pytest.raises(ValueError, match=r"4 results .* at least 5 .*evaluate seeds="):
-        rounding_tolerances(TOLERANCES, first, first[:4], 3)

@@ -98,8 +98,8 @@ def test_the_picture_shows_floor_and_paths_and_labels_with_a_legend_and_is_the_s
     frame |= {"rendered_depth": depth, "valid": np.ones((24, 32), bool), "title": "frame 0", "labels": labels}
     paths = Paths(poses, np.ones(len(poses), bool), poses if has_truth else None)
     for name in ("a.png", "b.png") if num_frames else ("a.png",):
-        classes = ("wall", "floor", "chair") if num_frames else ()
-        draw_overview(tmp_path / name, a_cloud(points), paths, [frame] * num_frames, "a run", classes)
+        classes = ("wall", "floor", "chair $_$") if num_frames else ()
+        draw_overview(tmp_path / name, a_cloud(points), paths, [frame] * num_frames, "a run of $\\a$", classes)
     path = tmp_path / "a.png"
     assert not num_frames or path.read_bytes() == (tmp_path / "b.png").read_bytes()
     floor, ours, truth = shares_of(path, (0, 0, 255), OURS, TRUTH)

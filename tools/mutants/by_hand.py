@@ -39,7 +39,7 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
         "the errors stay in the axes of the camera before",
     ),
     (
-        "mapping/run",
+        "mapping/integrate",
         "seen_from(there.covariance, there.pose, pose[None])[0]",
         "there.covariance",
         "the map's error stays in the axes of the camera that made it",
@@ -61,7 +61,7 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
         "edges the other way round",
     ),
     (
-        "mapping/submaps",
+        "mapping/atlas",
         "scale_covariance(place.covariance, 1.0 / unit)",
         "scale_covariance(place.covariance, 1.0 / scale)",
         "the unit of a place is that of the map after it has moved",

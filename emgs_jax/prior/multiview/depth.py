@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float
 from emgs_jax.ops.camera import Camera, nearest_pixel, project, unproject
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, traced
-from emgs_jax.prior.multiview.plane_sweep import SweepConfig, inverse_depths, sweep
+from emgs_jax.prior.multiview.plane_sweep import SweepConfig, inverse_depths, smallest, sweep
 from emgs_jax.prior.multiview.semi_global import SemiGlobalConfig, aggregate
 
 
@@ -60,7 +60,7 @@ def _median(depth: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:
     padded = jnp.pad(depth, radius, mode="edge")
     steps = range(2 * radius + 1)
     around = [jax.lax.dynamic_slice(padded, (dy, dx), (height, width)) for dy in steps for dx in steps]
-    return jnp.sort(jnp.stack(around), axis=0)[len(around) // 2]
+    return smallest(jnp.stack(around), len(around) // 2 + 1)[-1]
 
 
 @full_precision

@@ -73,9 +73,9 @@ def inverse_depths(near: Float[Array, ""], far: Float[Array, ""], config: SweepC
     return jnp.linspace(1.0 / far, 1.0 / near, config.num_planes)
 
 
-def _smallest(costs: Float[Array, "s h w"], count: int) -> Float[Array, "k h w"]:
-    """The least `count` of each pixel's costs, in order: by exchanges, as a sort of so few costs ten times as much."""
-    rows = list(costs)
+def smallest(values: Float[Array, "s h w"], count: int) -> Float[Array, "k h w"]:
+    """The least `count` of each pixel's values, in order: by exchanges, as a sort of so few costs ten times as much."""
+    rows = list(values)
     count = min(count, len(rows))
     for done in range(count):
         for row in range(len(rows) - 1, done, -1):
@@ -120,6 +120,6 @@ def sweep(
             return jnp.where(inside & (depth > 0) & used, differing / num_taps, config.unseen_cost)
 
         costs = jax.vmap(source_cost)(directions, T_source_reference.translation(), codes, is_used)
-        return jnp.mean(_smallest(costs, config.num_best), axis=0)
+        return jnp.mean(smallest(costs, config.num_best), axis=0)
 
     return jnp.moveaxis(jax.lax.map(plane_cost, planes), 0, -1)

@@ -140,37 +140,6 @@ def test_metric_pictures_have_units_of_a_metre(tmp_path):
     assert (open_depths(tmp_path, "up_to_scale", 1000.0).read(0) == 2500).all()
 
 
-def broken(folder, case):
-    if case == "coloured":
-        for stem in STEMS:
-            cv2.imwrite(str(folder / f"{stem}.png"), np.random.default_rng(0).integers(0, 255, (6, 8, 3), np.uint8))
-    elif case == "below":
-        (folder / "depth_npy").mkdir()
-    elif case == "nameless":
-        np.savez(folder / "v.npz", a=VALUES, b=VALUES)
-    elif case == "flat":
-        np.save(folder / "v.npy", VALUES[0])
-    elif case == "cropped":
-        np.save(folder / "v.npy", VALUES[:, :, :4])
-
-
-@pytest.mark.parametrize(
-    ("case", "message"),
-    [
-        ("coloured", "a 1.png is a coloured picture"),
-        ("below", "has the folders depth_npy"),
-        ("nameless", "has a, b: name the depths"),
-        ("flat", r"\(frames, h, w\)"),
-        ("cropped", "must show the whole image"),
-        ("nothing", "no file"),
-    ],
-)
-def test_what_is_wrong_is_said_before_anything_is_computed(tmp_path, case, message):
-    broken(tmp_path, case)
-    with pytest.raises(ValueError, match=message):
-        way_of_files(config(tmp_path)).check(Frames(STEMS))
-
-
 def config(folder, kind="affine_inverse"):
     words = (
         "prior=multiview_stereo",

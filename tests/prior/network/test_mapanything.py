@@ -181,20 +181,3 @@ def test_outputs_and_frames_that_do_not_fit_are_refused():
         prior.predict(window, frames, data.intrinsics)
     with pytest.raises(ValueError, match="in that order"):
         prior.predict(window, frames[::-1], data.intrinsics)
-
-
-@pytest.mark.parametrize(
-    ("overrides", "text"),
-    [
-        (("model=vggt", "checkpoint=somewhere"), "vggt reads its weights from the caches"),
-        (("model=mapanithing",), "one of mapanything, vggt"),
-        (("resolution=[518,400]",), "multiples of 14"),
-        (("resolution=[518]",), "multiples of 14"),
-        (("anchor_pose=maybe",), "on or off"),
-        (("anchor_depth_m=0",), "above 0"),
-        (("compute.amp=int8",), "bf16, fp16 or float32"),
-    ],
-)
-def test_a_value_without_sense_is_named(overrides, text):
-    with pytest.raises(hydra.errors.InstantiationException, match=text):
-        make(Double(Sphere()), *overrides)
