@@ -105,6 +105,10 @@ def find_movers(
     variance of z - d is that of both depths, 2 (ν z)², and what the pose of the frame may err at that distance. What no
     look saw is static.
 
+    Depths of a network drift: what stands comes nearer by some percent a frame, until all older looks see through it.
+    What moves leaves free space from one look to the next. With j the largest step, in standard deviations, of the free
+    space behind a point from one look to the one before that, the log-odds of static are prior + hit - j²/2 at least.
+
     Args:
         view: camera frame, in the map's unit.
         T_previous_camera: from this camera to that of the last frame.
@@ -113,20 +117,25 @@ def find_movers(
     pose_variance = jnp.diagonal(estimate.covariance)
     shift, turn = jnp.mean(pose_variance[:3]), jnp.mean(pose_variance[3:6])
 
-    def ratio(look: tuple[Float[Array, "2 p"], Bool[Array, "p"], Float[Array, "7"]]) -> Float[Array, "p"]:
+    def compare(
+        look: tuple[Float[Array, "2 p"], Bool[Array, "p"], Float[Array, "7"]],
+    ) -> tuple[Float[Array, "p"], Float[Array, "p"]]:
+        """Log-likelihood ratio of a look, and the free space that it shows behind each point; 0 where it shows none."""
         (nearest, farthest), moving, T_previous_look = look[0], look[1], jaxlie.SE3(look[2])
         pixels, z = project(camera, (T_previous_look.inverse() @ T_previous_camera) @ view.points)
         index, inside = nearest_pixel(pixels, (camera.height, camera.width))
         std = jnp.sqrt(2.0 * (estimate.depth_noise * z) ** 2 + shift + turn * z**2)
-        before, behind = nearest[index] - z, z - farthest[index]
-        gap = jnp.maximum(jnp.maximum(before, behind), 0.0) / jnp.maximum(std, NEAREST_DEPTH)
-        found = jnp.maximum(config.hit - 0.5 * gap**2, jnp.where(before > 0, -config.miss, 0.0))
+        std = jnp.maximum(std, NEAREST_DEPTH)
+        before, behind = (jnp.maximum(gap, 0.0) / std for gap in (nearest[index] - z, z - farthest[index]))
+        found = jnp.maximum(config.hit - 0.5 * (before + behind) ** 2, jnp.where(before > 0, -config.miss, 0.0))
         found = jnp.where(moving[index], jnp.minimum(found, 0.0), found)
         is_seen = inside & (z > NEAREST_DEPTH) & (nearest[index] > 0)
-        return jnp.where(is_seen, found, 0.0)
+        return jnp.where(is_seen, found, 0.0), jnp.where(is_seen, before, 0.0)
 
-    ratios = jax.vmap(ratio)((looks.depth, looks.moving, looks.T_previous_look.wxyz_xyz))
-    log_odds = jnp.where(view.valid, config.prior + jnp.sum(ratios, axis=0), 0.0)
+    ratios, free = jax.vmap(compare)((looks.depth, looks.moving, looks.T_previous_look.wxyz_xyz))
+    step = jnp.max(jnp.diff(jax.lax.cummax(free), axis=0, prepend=0.0), axis=0)
+    standing, drifting = jnp.sum(ratios, axis=0), config.hit - 0.5 * step**2
+    log_odds = jnp.where(view.valid, config.prior + jnp.maximum(standing, drifting), 0.0)
     most = config.miss * looks.depth.shape[0]
     limited = jnp.clip(log_odds, -most, most)
     return view.valid & (_box_sum(limited, camera, config.radius) < 0) & (estimate.depth_noise > 0)

@@ -120,7 +120,7 @@ class StepInfo(eqx.Module):
     Args:
         origin: median birth of the Gaussians that explain its points, its own if none do.
         num_left_out: points of the current frame that no map can hold, or with a number that is not finite.
-        moving: points that are taken for moving.
+        moving: pixels of the thinned image that are taken for moving.
     """
 
     T_world_camera: jaxlie.SE3
@@ -131,7 +131,7 @@ class StepInfo(eqx.Module):
     origin: Int[Array, ""]
     num_gaussians: Int[Array, ""]
     num_left_out: Int[Array, ""]
-    moving: Bool[Array, "p"]
+    moving: Bool[Array, "h w"]
     overflow: Overflow
 
 
@@ -280,7 +280,7 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         origin=fused.origin,
         num_gaussians=num_gaussians,
         num_left_out=num_left_out,
-        moving=moving,
+        moving=moving.reshape(view.height, view.width),
         overflow=Overflow(overflow, submap.overflow, refinement.overflow),
     )
     looks = None if state.looks is None else _look(state.looks, frame, state.T_world_previous, view)

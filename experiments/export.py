@@ -22,7 +22,7 @@ def export_run(config: DictConfig) -> list[Path]:
     for key, field in declared(ExportConfig).items():
         check_value(key, config[key], field)
     formats, length = list(dict.fromkeys(map(str, config.formats))), config.length and [float(n) for n in config.length]
-    wanted = ExportConfig(formats, config.max_points, config.scale, length, str(config.images))
+    wanted = ExportConfig(formats, config.max_points, config.scale, length, str(config.images), str(config.moving))
     run = read_run(Path(str(config.folder)))
     folder = run.folder if config.out is None else Path(str(config.out))
     check_writable(folder, f"{'folder' if config.out is None else 'out'}={folder}")

@@ -59,6 +59,7 @@ def walking(count):
 
 
 HERE = with_block()
+DRIFTED = [WALL * 1.03**-step for step in range(13)]  # as depths of a network
 CASES = {
     "nothing new": ([WALL] * 5, WALL, {}, NOTHING),
     "a block where a wall was seen": ([WALL] * 5, HERE, {}, BLOCK),
@@ -75,6 +76,8 @@ CASES = {
     "one that is gone": ([HERE] * 5, WALL, {}, NOTHING),
     "a wrong prediction: a line": ([WALL] * 5, with_block(where=COLUMNS == 30), {}, NOTHING),
     "a wrong prediction: pixels": ([WALL] * 5, with_block(where=(COLUMNS % 4 + ROWS % 4) == 0), {}, NOTHING),
+    "nearer in each frame: a drift": (DRIFTED[:12], DRIFTED[12], {}, NOTHING),
+    "a block before it": (DRIFTED[:12], with_block(1.2, wall=DRIFTED[12]), {}, BLOCK),
     "nearer by what depths err": ([WALL] * 5, with_block(2.9), {}, NOTHING),
     "a pose that is not known": ([WALL] * 5, HERE, {"std": 0.5}, NOTHING),
     "a noise that is not known": ([WALL] * 5, HERE, {"noise": 0.0}, NOTHING),

@@ -12,6 +12,7 @@ from emgs_jax import (
     gaussians,
     initialization,
     localization,
+    motion,
     semantics,
     splitting,
     surface_extrapolation,
@@ -30,6 +31,7 @@ CONFIG = sc.slam_config("slam.submap.map_capacity=48", "slam.submap.submap_capac
 DENSIFY = densify.DensifyConfig(0.05, 0.3, 0.0, CONFIG.refinement.render, "map")
 ONE, TENTH, FEW = sc.device(1.0), sc.device(0.1), sc.device(0.01)
 ROWS = np.arange(192)
+MOTION = sc.slam_config("slam.motion.num_looks=3").motion
 
 
 def map_of(seed: int) -> gaussian_map.GaussianMap:
@@ -74,6 +76,15 @@ def belief_of(seed: int) -> pose_estimate.PoseEstimate:
 def coarse_of(seed: int) -> localization.CoarsePose:
     T, numbers = sc.path_pose(2 + seed), map(sc.device, (1.0, 0.02, 2.0, 0.01))
     return localization.CoarsePose(T, T, *numbers, belief_of(seed), *[jnp.asarray(True)] * 4)
+
+
+def looks_of(seed: int) -> motion.Looks:
+    """Two frames of the room, of which some rows were taken for moving."""
+    looks = motion.no_looks(previous_of(seed), MOTION)
+    for number in (0, 1):
+        T, moving = sc.path_pose(number + seed), jnp.asarray((ROWS - number) % 7 == 0)
+        looks = motion.look_again(looks, previous_of(seed + number), moving, T, sc.path_pose(seed), CAMERA)
+    return looks
 
 
 def estep_of(seed: int) -> em.EStep:
@@ -245,6 +256,14 @@ VERBS = {
             m, jnp.arange(32) % 3 > 0, T.translation(), ONE * 0.1, CONFIG.existence
         ),
         lambda s: (map_of(s), looking(s)),
+    ),
+    "look_again": (
+        lambda k, o, T: motion.look_again(k, o, jnp.asarray(ROWS % 5 == 0), T, sc.path_pose(1), CAMERA),
+        lambda s: (looks_of(s), previous_of(s), sc.path_pose(1 + s)),
+    ),
+    "find_movers": (
+        lambda k, o, T, b: motion.find_movers(k, o, T, b, CAMERA, MOTION),
+        lambda s: (looks_of(s), sc.observe_room(sc.path_pose(2 + s), CAMERA, 2), looking(s), belief_of(s)),
     ),
     "num_independent": (
         lambda e, p: noise.num_independent(e, p, jnp.arange(40) % 3 > 0),

@@ -60,7 +60,14 @@ def _write(path: Path, lines: list[str]) -> None:
     write_file(path, "\n".join(lines) + "\n")
 
 
-def save_transforms(path: Path, camera: Camera, names: Sequence[str], T_world_camera: Any, points_file: str) -> None:
+def save_transforms(
+    path: Path,
+    camera: Camera,
+    names: Sequence[str],
+    T_world_camera: Any,
+    points_file: str,
+    masks: Sequence[str] = (),
+) -> None:
     """Write transforms.json of one pinhole camera.
 
     Args:
@@ -68,12 +75,15 @@ def save_transforms(path: Path, camera: Camera, names: Sequence[str], T_world_ca
         names: of the image files, from the folder of `path`.
         T_world_camera: (n, 4, 4), OpenCV axes, metres.
         points_file: a PLY in the same world, from the folder of `path`.
+        masks: of each image, black where it is not to be used, likewise; none for no image.
     """
     (fx, fy), (cx, cy) = np.float64(camera.focal), np.float64(camera.center)
     known = {"camera_model": "PINHOLE", "w": camera.width, "h": camera.height}
     known |= {"fl_x": fx, "fl_y": fy, "cx": cx + 0.5, "cy": cy + 0.5, "ply_file_path": points_file}
     poses = np.asarray(T_world_camera, np.float64) * FLIP
     frames = [{"file_path": name, "transform_matrix": pose} for name, pose in zip(names, poses, strict=True)]
+    for frame, mask in zip(frames, masks, strict=False):
+        frame["mask_path"] = mask
     write_json(path, known | {"frames": frames})
 
 

@@ -4,7 +4,7 @@ A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; file
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -14,6 +14,7 @@ from tqdm import tqdm
 
 from emgs_jax.back_end.state import Node
 from emgs_jax.device.arrays import to_matrix
+from emgs_jax.io.run_lengths import to_run_lengths
 from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
 from emgs_jax.mapping.event import JOINED, NEW_SUBMAP, RESTARTED, Event
@@ -80,6 +81,7 @@ class FrameRecord:
         repeat_rms: robust standard deviation between the two predictions of the previous image, m.
         left_out: pixels with a prediction that is not finite, behind the camera or farther than a map can hold.
         moving: share of the pixels that are taken for moving.
+        moving_pixels: which of the thinned image, see `to_run_lengths`; None where none is.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
         mean_log_joint: of the fused points with their best Gaussians.
@@ -115,6 +117,7 @@ class FrameRecord:
     repeat_rms: float | None = None
     left_out: int = 0
     moving: float | None = None
+    moving_pixels: Mapping[str, Any] | None = None
     fused: int | None = None
     updated: int | None = None
     mean_log_joint: float | None = None
@@ -171,6 +174,7 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
     localization, em, refinement = info.localization, info.em, info.refinement
     reasons = [words for bit, words in enumerate(REASONS) if int(localization.reason) >> bit & 1]
     moving = float(np.mean(info.moving))
+    pixels = to_run_lengths(info.moving) if moving else None
     reasons = [HIDDEN] if reasons and moving > MOST_MOVING else reasons
     return {
         "status": "tracked" if localization.is_tracked else "lost" if localization.is_lost else "degraded",
@@ -183,6 +187,7 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
         "step_rad": float(localization.step_rad),
         "repeat_rms": float(localization.repeat_rms),
         "moving": moving,
+        "moving_pixels": pixels,
         "fused": int(em.num_fused),
         "updated": int(em.num_updated),
         "mean_log_joint": float(em.mean_log_joint) if em.num_fused else None,

@@ -23,6 +23,7 @@ from emgs_jax.mapping.run import MappingRun, with_truth
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.report.labelling import LabelledMap
+from emgs_jax.report.moving import with_moving
 
 _densify = stored(densify)
 
@@ -148,7 +149,7 @@ def center_cloud(run: MappingRun) -> PointCloud:
 
 def _picture(run: MappingRun, dataset: Dataset, row: int, view: Any) -> dict[str, Any]:
     return {
-        "image": dataset[row].image,
+        "image": with_moving(dataset[row].image, vars(run.records[row])),
         "rendered_color": view.colors,
         "rendered_depth": np.where(view.valid, view.depth, 0.0),
         "valid": view.valid,

@@ -21,6 +21,7 @@ from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.ranges import number
 from emgs_jax.report.colors import OURS, STATUS_COLORS, rgb
+from emgs_jax.report.moving import moving_mask
 from emgs_jax.report.recorded_run import RecordedRun
 
 POINTS_FILE = "points.ply"
@@ -38,6 +39,7 @@ class ExportConfig:
         scale: factor on all lengths; None = 1.
         length: instead of it two frames and the metres between their cameras, see `factor_of`.
         images: as `used` in the run, or in the `original` size on disk; either way without distortion.
+        moving: `kept` in the images, or `masked`: a mask beside each, black where something moves.
     """
 
     formats: Sequence[str]
@@ -45,6 +47,7 @@ class ExportConfig:
     scale: float | None = number(low=1e-6, high=1e6)
     length: Sequence[float] | None = number(low=0, high=2**31)
     images: str = field(default="used", metadata={"choices": ("used", "original")})
+    moving: str = field(default="kept", metadata={"choices": ("kept", "masked")})
 
 
 def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
@@ -71,7 +74,7 @@ def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: Readab
             _frustums(run, folder / FORMATS[name])
         else:
             write = _colmap if name == "colmap" else _nerfstudio
-            write(run, folder / FORMATS[name], dataset, config.max_points)
+            write(run, folder / FORMATS[name], dataset, config)
     return [folder / FORMATS[name] for name in config.formats]
 
 
@@ -84,24 +87,29 @@ def find_factor(run: RecordedRun, config: ExportConfig) -> float | None:
     return factor_of(run, config.length)
 
 
-def _colmap(run: RecordedRun, folder: Path, dataset: ReadableFrames, max_points: int) -> None:
-    """Write a project folder: images/ and sparse/0/."""
+def _colmap(run: RecordedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig) -> None:
+    """Write a project folder: images/, sparse/0/, and masks/ by COLMAP's names."""
     with new_folder(folder) as new:
         names = _write_images(new / "images", run, dataset)
+        if config.moving == "masked":
+            _write_masks(new / "masks", run, [f"{name}.png" for name in names])
         model = new / "sparse" / "0"
         model.mkdir(parents=True)
-        save_colmap(model, run.camera, names, run.poses[run.is_placed], *_cloud(run, max_points))
+        save_colmap(model, run.camera, names, run.poses[run.is_placed], *_cloud(run, config.max_points))
 
 
-def _nerfstudio(run: RecordedRun, folder: Path, dataset: ReadableFrames, max_points: int) -> None:
-    """Write images/, points.ply and transforms.json."""
+def _nerfstudio(run: RecordedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig) -> None:
+    """Write images/, masks/, points.ply and transforms.json."""
     with new_folder(folder) as new:
-        names = _write_images(new / "images", run, dataset)
-        points, colors = _cloud(run, max_points)
+        names, masks = _write_images(new / "images", run, dataset), []
+        if config.moving == "masked":
+            masks = [f"masks/{name}" for name in names]
+            _write_masks(new / "masks", run, names)
+        points, colors = _cloud(run, config.max_points)
         vertices = np.rec.fromarrays(points.T.astype(np.float32), names="x,y,z")
         write_ply(new / POINTS_FILE, with_colors(vertices, colors / 255.0))
         files = [f"images/{name}" for name in names]
-        save_transforms(new / "transforms.json", run.camera, files, run.poses[run.is_placed], POINTS_FILE)
+        save_transforms(new / "transforms.json", run.camera, files, run.poses[run.is_placed], POINTS_FILE, masks)
 
 
 def _frustums(run: RecordedRun, path: Path) -> None:
@@ -123,6 +131,16 @@ def _write_images(folder: Path, run: RecordedRun, dataset: ReadableFrames) -> li
         if not cv2.imwrite(str(folder / names[-1]), cv2.cvtColor(dataset[row].image, cv2.COLOR_RGB2BGR)):
             raise OSError(f"{folder / names[-1]} cannot be written: is the disk full?")
     return names
+
+
+def _write_masks(folder: Path, run: RecordedRun, names: Sequence[str]) -> None:
+    """Write masks of these names for the placed frames, black where something moves."""
+    folder.mkdir()
+    size = run.camera.width, run.camera.height
+    for row, name in zip(np.flatnonzero(run.is_placed), names, strict=True):
+        kept = np.uint8(255) * ~moving_mask(run.frames[row], size)
+        if not cv2.imwrite(str(folder / name), kept):
+            raise OSError(f"{folder / name} cannot be written: is the disk full?")
 
 
 def _cloud(run: RecordedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:

@@ -21,6 +21,7 @@ from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report.layers import map_layers
+from emgs_jax.report.moving import with_moving
 from emgs_jax.report.viewer import Viewer
 from emgs_jax.report.viewer_scene import Shown
 
@@ -106,7 +107,7 @@ class LiveView:
                 frames=[vars(record) | {"index": self._kept[record.index]} for record in records],
                 poses=np.stack([record.pose for record in records]),
                 truth=np.full((len(records), 3), np.nan),
-                image=np.ascontiguousarray(image[::step, ::step]),
+                image=with_moving(np.ascontiguousarray(image[::step, ::step]), vars(records[-1])),
             )
         )
         end = time.monotonic()

@@ -1,7 +1,7 @@
 """Small pictures for the page: what the camera saw, what the map shows from there, and how far away it is."""
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import jaxlie
@@ -19,6 +19,7 @@ from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.report.colors import to_bytes
 from emgs_jax.report.display import closed
 from emgs_jax.report.html import jpeg
+from emgs_jax.report.moving import with_moving
 from emgs_jax.report.recorded_run import RecordedRun
 
 WIDTH = 200  # pixels; a picture is not wider
@@ -67,17 +68,16 @@ def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, data
     for row in rows:
         color, depth = drawn.get(row, (None, None))
         rendered = "" if color is None else jpeg(to_bytes(color))
-        pictures.append(
-            Picture(row, _seen(dataset, row), rendered, "" if depth is None else jpeg(_painted(depth, near, far)))
-        )
+        seen, painted = _seen(dataset, row, run.frames[row]), "" if depth is None else jpeg(_painted(depth, near, far))
+        pictures.append(Picture(row, seen, rendered, painted))
     return Views(pictures, near, far)
 
 
-def _seen(dataset: Dataset | None, row: int) -> str:
+def _seen(dataset: Dataset | None, row: int, line: Mapping[str, Any]) -> str:
     if dataset is None:
         return ""
     try:
-        image = Image.fromarray(dataset[row].image)
+        image = Image.fromarray(with_moving(dataset[row].image, line))
     except (BadFrameError, OSError):  # gone since the run
         return ""
     image.thumbnail((WIDTH, WIDTH * image.height), Image.Resampling.BOX)

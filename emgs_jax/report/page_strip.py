@@ -43,14 +43,15 @@ def strip(run: RecordedRun, errors: dict[str, np.ndarray]) -> list[Row]:
         factor, unit = (100, "cm") if has_metric_truth(run.provenance) else (1, "units")
         curves = {name: factor * errors[name] for name in ERRORS if name in errors}
         rows.append(_curves("error of the position", unit, curves, 64))
-    inliers, residual, scale, new, seconds, compiling = (
-        _numbers(run, name) for name in ("inliers", "residual", "scale", "new", "seconds", "compile_seconds")
-    )
+    names = "inliers", "residual", "scale", "moving", "new", "seconds", "compile_seconds"
+    inliers, residual, scale, moving, new, seconds, compiling = (_numbers(run, name) for name in names)
     residual[inliers == 0] = np.nan  # of nothing
+    moving = np.where((moving > 0).any(), moving, np.nan)
     for label, unit, values in (
         ("inliers", "points", inliers),
         ("residual", "% of the depth", 100 * residual),
         ("scale of the prediction", "", scale),
+        ("what moves", "% of the pixels", 100 * moving),
         ("new Gaussians", "", new),
         ("mapping", "s", seconds - compiling),
     ):

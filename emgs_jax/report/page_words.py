@@ -9,6 +9,7 @@ from emgs_jax.mapping.records import APART
 from emgs_jax.report import columns
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
 from emgs_jax.report.html import Head, commit_words
+from emgs_jax.report.moving import MUCH
 from emgs_jax.report.provenance import RAW_PRIOR, in_unit, length_words, lines_of
 from emgs_jax.report.recorded_run import POLISH, RecordedRun, sound
 from emgs_jax.report.repeat import Repeated
@@ -214,9 +215,10 @@ def frame_facts(line: Mapping[str, Any]) -> str:
         "inliers": lambda v: f"{v:,} inliers",
         "residual": lambda v: f"residual {100 * v:.1f} % of the depth",
         "scale": lambda v: f"scale {v:.3f}",
+        "moving": lambda v: f"{100 * v:.0f} % moving" if v >= MUCH else "",
         "new": lambda v: f"{v:,} new",
         "num_gaussians": lambda v: f"{v:,} Gaussians",
         "seconds": lambda v: f"{v:.2f} s",
     }
     found = [say(line[name]) for name, say in known.items() if isinstance(line.get(name), int | float)]
-    return " · ".join(found)
+    return " · ".join(filter(None, found))

@@ -18,10 +18,10 @@ from emgs_jax.mapping.records import (
 )
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, aligned, metric_table
+from emgs_jax.report.moving import MUCH
 from emgs_jax.report.provenance import in_unit, lines_of
 
 MANY = 0.1  # share of frames
-MUCH = 0.03  # share of pixels; less may be wrong predictions
 
 
 def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:

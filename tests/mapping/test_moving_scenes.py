@@ -54,7 +54,7 @@ def stage(case):
 def test_a_camera_that_stands_stays_where_it_is_and_maps_nothing_that_moves(case):
     frames = stage(case)
     prior = build(compose("prior.level=0.5"), "prior", classes=list(frames.classes))
-    run, _ = map_tiny(frames, prior, "slam.motion.num_looks=8", "slam.existence.gone=3")
+    run, _ = map_tiny(frames, prior, "slam/motion=default", "slam.motion.num_looks=8")
     moves = np.array([(frame.moving == MOVES).mean() for frame in frames])
     said = np.array([record.moving or 0.0 for record in run.records])
     truth = frames.pose(0)

@@ -77,6 +77,21 @@ def test_pycolmap_reads_the_cameras_where_they_are(written):
     np.testing.assert_allclose(camera.cam_from_img([0.5, 0.5])[0], -INTRINSICS[2] / INTRINSICS[0], rtol=1e-6)
 
 
+def test_masks_of_what_moves_have_the_names_that_other_programs_look_for(tmp_path):
+    run = a_run(tmp_path)
+    half = {"size": [SIZE[1], SIZE[0]], "counts": [0, SIZE[0] * SIZE[1] // 2, SIZE[0] * SIZE[1] // 2]}
+    run.frames[1]["moving_pixels"] = half
+    export(run, run.folder, replace(ALL, formats=("colmap", "nerfstudio"), moving="masked"), Shown())
+    frames = json.loads((tmp_path / "nerfstudio" / "transforms.json").read_text())["frames"]
+    for number, frame in enumerate(frames):
+        name = frame["file_path"].rpartition("/")[2]
+        ours = tmp_path / "nerfstudio" / frame["mask_path"], tmp_path / "colmap" / "masks" / f"{name}.png"
+        for mask in (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in ours):
+            expected = np.full(SIZE[::-1], 255)
+            expected[: SIZE[1] // 2] *= number != 1
+            np.testing.assert_array_equal(mask, expected)
+
+
 def test_points_keep_place_and_colour(written):
     cloud = read_vertices(written.folder / "points.ply")
     known = {round(float(x), 5): row for row, x in enumerate(cloud["x"])}

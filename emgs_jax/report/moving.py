@@ -1,0 +1,35 @@
+"""What was taken for moving: over images, and as masks for other programs."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+from jaxtyping import Bool, UInt8
+
+from emgs_jax.data.reading import resize_nearest
+from emgs_jax.io.run_lengths import from_run_lengths
+
+MUCH = 0.03  # share of pixels; less may be wrong predictions
+_TINT, _OPACITY = np.array([0, 230, 0]), 0.6
+
+
+def moving_mask(line: Mapping[str, Any], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """What moves in the frame of a line of frames.jsonl, in an image of (width, height) `size`.
+
+    Raises:
+        ValueError: the line holds no mask.
+    """
+    if not line.get("moving_pixels"):
+        return np.zeros(size[::-1], bool)
+    try:
+        found = from_run_lengths(line["moving_pixels"])
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"moving_pixels of frame {line.get('index')} in frames.jsonl is no mask: run again") from error
+    return resize_nearest(found.astype(np.int32), size) > 0
+
+
+def with_moving(image: UInt8[np.ndarray, "h w 3"], line: Mapping[str, Any]) -> UInt8[np.ndarray, "h w 3"]:
+    """The image of a frame, green where something moves."""
+    is_moving = moving_mask(line, image.shape[1::-1])[..., None]
+    tinted = (1.0 - _OPACITY) * image + _OPACITY * _TINT
+    return np.where(is_moving, tinted, image).astype(np.uint8)
