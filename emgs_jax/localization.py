@@ -121,8 +121,8 @@ class CoarsePose(eqx.Module):
     estimate: PoseEstimate
     is_known: Bool[Array, ""]
     is_usable: Bool[Array, ""]
-    has_field: Bool[Array, ""]
-    is_placed: Bool[Array, ""]
+    has_field: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.ones((), bool))
+    is_placed: Bool[Array, ""] = eqx.field(default_factory=lambda: jnp.zeros((), bool))
 
 
 class LocalizationInfo(eqx.Module):

@@ -18,7 +18,8 @@ import numpy as np
 
 MAGIC = 0x1950A86A20F9469CFC6C
 DTYPES = {"torch FloatStorage": "<f4", "torch LongStorage": "<i8"}
-BAD_ARCHIVE = (BadZipFile, EOFError, zlib.error)
+DAMAGED = (LookupError, TypeError, AttributeError, UnicodeDecodeError, RuntimeError, OverflowError)
+DAMAGED += (BadZipFile, EOFError, zlib.error)
 _MARK = object()
 
 
@@ -39,7 +40,7 @@ def read_tensors(content: bytes, key: str | None) -> dict[str, np.ndarray]:
         saved, storages = (_from_archive if content.startswith(b"PK") else _from_stream)(BytesIO(content))
         tensors: Mapping[str, _Tensor] = saved if key is None else saved[key]
         return {name: _array(storages[tensor.storage[2]], tensor) for name, tensor in tensors.items()}
-    except (LookupError, TypeError, AttributeError, UnicodeDecodeError, RuntimeError, *BAD_ARCHIVE) as error:
+    except DAMAGED as error:
         raise ValueError(f"damaged ({type(error).__name__}: {error})") from error
 
 

@@ -103,17 +103,6 @@ def test_a_frame_whose_tracking_was_lost_or_whose_pose_is_not_there_has_no_truth
         ReadableFrames(load(seven_scenes_root))
 
 
-def test_missing_depth_and_images_of_another_size_name_the_file(seven_scenes_root):
-    folder = seven_scenes_root / "kitchen" / "seq-01"
-    (folder / "frame-000001.depth.png").unlink()
-    cv2.imwrite(str(folder / "frame-000002.color.jpg"), color_image(2, (320, 240)))
-    dataset = load(seven_scenes_root)
-    with pytest.raises(BadFrameError, match="frame-000001.depth.png is missing"):
-        dataset[1]
-    with pytest.raises(BadFrameError, match="frame-000002.color.jpg is 320x240"):
-        dataset[2]
-
-
 def test_poses_are_the_published_poses_of_the_colour_camera(shared_data):
     root = shared_data("7scenes")
     published = {}

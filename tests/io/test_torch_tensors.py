@@ -69,3 +69,15 @@ def test_a_file_that_is_cut_or_another_is_refused(is_archive, tmp_path):
             read_tensors(content[:length], "model")
     with pytest.raises(ValueError):
         read_tensors(b"PK\x03\x04" + bytes(100), "model")
+
+
+def test_a_storage_that_no_memory_holds_is_damage(tmp_path):
+    """It was an OverflowError."""
+    torch, stream = pytest.importorskip("torch", reason="torch is not installed"), io.BytesIO()
+    whole = zipfile.ZipFile(io.BytesIO(saved({"a": torch.zeros(2, 3)}, tmp_path, is_archive=True)))
+    with zipfile.ZipFile(stream, "w") as archive:
+        for name in whole.namelist():
+            six, huge = b"cpuq\x06K\x06t", b"cpuq\x06\x8a\x09" + (2**70).to_bytes(9, "little") + b"t"
+            archive.writestr(name, whole.read(name).replace(six, huge))
+    with pytest.raises(ValueError, match="damaged .OverflowError"):
+        read_tensors(stream.getvalue(), None)
