@@ -6,7 +6,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
 from emgs_jax.observation import Observation, depth_range
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
@@ -21,7 +21,6 @@ class MotionConfig(eqx.Module):
     Args:
         num_looks: tracked frames before the current one that are compared with it; 0: nothing is taken for moving, as
             printed. What stands still for about half as many becomes map.
-        num_latest: of these, the newest, one of which shows what leaves.
         hit: log-likelihood ratio, static to moving, of a look that shows a surface exactly where the point is.
         miss: the most that a look which shows free space there takes away: it may be a wrong prediction.
         prior: log-odds of static before any look.
@@ -30,7 +29,6 @@ class MotionConfig(eqx.Module):
     """
 
     num_looks: int = static(low=0, high=64)
-    num_latest: int = static(low=1, high=64)
     hit: Float[Array, "*b"] = traced(low=0)
     miss: Float[Array, "*b"] = traced(low=0)
     prior: Float[Array, "*b"] = traced(low=-math.inf)
@@ -116,61 +114,31 @@ def find_movers(
         T_previous_camera: from this camera to that of the last frame.
         estimate: of this pose, with the noise ν of depths; where that is 0 it is not known, and nothing moves.
     """
-    gaps, _, is_seen, index = _gaps(looks, view.points, T_previous_camera, estimate, camera)
-    ratios = jnp.maximum(config.hit - 0.5 * gaps**2, jnp.where(gaps > 0, -config.miss, 0.0))
-    is_marked = jnp.take_along_axis(looks.moving, index, axis=1)
-    ratios = jnp.where(is_seen, jnp.where(is_marked, jnp.minimum(ratios, 0.0), ratios), 0.0)
-    free = jnp.where(is_seen, jnp.maximum(gaps, 0.0), 0.0)
+    pose_variance = jnp.diagonal(estimate.covariance)
+    shift, turn = jnp.mean(pose_variance[:3]), jnp.mean(pose_variance[3:6])
+
+    def compare(
+        look: tuple[Float[Array, "2 p"], Bool[Array, "p"], Float[Array, "7"]],
+    ) -> tuple[Float[Array, "p"], Float[Array, "p"]]:
+        """Log-likelihood ratio of a look, and the free space that it shows behind each point; 0 where it shows none."""
+        (nearest, farthest), moving, T_previous_look = look[0], look[1], jaxlie.SE3(look[2])
+        pixels, z = project(camera, (T_previous_look.inverse() @ T_previous_camera) @ view.points)
+        index, inside = nearest_pixel(pixels, (camera.height, camera.width))
+        std = jnp.sqrt(2.0 * (estimate.depth_noise * z) ** 2 + shift + turn * z**2)
+        std = jnp.maximum(std, NEAREST_DEPTH)
+        before, behind = (jnp.maximum(gap, 0.0) / std for gap in (nearest[index] - z, z - farthest[index]))
+        found = jnp.maximum(config.hit - 0.5 * (before + behind) ** 2, jnp.where(before > 0, -config.miss, 0.0))
+        found = jnp.where(moving[index], jnp.minimum(found, 0.0), found)
+        is_seen = inside & (z > NEAREST_DEPTH) & (nearest[index] > 0)
+        return jnp.where(is_seen, found, 0.0), jnp.where(is_seen, before, 0.0)
+
+    ratios, free = jax.vmap(compare)((looks.depth, looks.moving, looks.T_previous_look.wxyz_xyz))
     step = jnp.max(jnp.diff(jax.lax.cummax(free), axis=0, prepend=0.0), axis=0)
     standing, drifting = jnp.sum(ratios, axis=0), config.hit - 0.5 * step**2
     log_odds = jnp.where(view.valid, config.prior + jnp.maximum(standing, drifting), 0.0)
     most = config.miss * looks.depth.shape[0]
     limited = jnp.clip(log_odds, -most, most)
     return view.valid & (_box_sum(limited, camera, config.radius) < 0) & (estimate.depth_noise > 0)
-
-
-@full_precision
-def shown_lately(
-    looks: Looks,
-    points: Float[Array, "n 3"],
-    T_previous_points: jaxlie.SE3,
-    estimate: PoseEstimate,
-    camera: Camera,
-    config: MotionConfig,
-) -> Bool[Array, "n"]:
-    """Which points are surface in one of the latest looks, and not at its edge, where depths are wrong most often.
-
-    Args:
-        T_previous_points: from their frame to the camera of the last frame.
-        estimate: of that camera's pose, with the noise of depths.
-    """
-    latest = jax.tree.map(lambda leaf: leaf[: config.num_latest], looks)
-    _, widest, is_seen, _ = _gaps(latest, points, T_previous_points, estimate, camera)
-    return jnp.any(is_seen & (0.5 * widest**2 < config.hit), axis=0)
-
-
-def _gaps(
-    looks: Looks, points: Float[Array, "n 3"], T_previous_points: jaxlie.SE3, estimate: PoseEstimate, camera: Camera
-) -> tuple[Float[Array, "k n"], Float[Array, "k n"], Bool[Array, "k n"], Int[Array, "k n"]]:
-    """How far before the depths of each look points are, in standard deviations; negative behind them, 0 among them.
-
-    Returns:
-        The gaps, how far the depth is that differs most, whether the look shows anything there, and in which row.
-    """
-    pose_variance = jnp.diagonal(estimate.covariance)
-    shift, turn = jnp.mean(pose_variance[:3]), jnp.mean(pose_variance[3:6])
-
-    def gap(look: tuple[Float[Array, "2 p"], Float[Array, "7"]]) -> tuple[Array, Array, Array, Array]:
-        (nearest, farthest), T_previous_look = look[0], jaxlie.SE3(look[1])
-        pixels, z = project(camera, (T_previous_look.inverse() @ T_previous_points) @ points)
-        index, inside = nearest_pixel(pixels, (camera.height, camera.width))
-        std = jnp.maximum(jnp.sqrt(2.0 * (estimate.depth_noise * z) ** 2 + shift + turn * z**2), NEAREST_DEPTH)
-        before, behind = (nearest[index] - z) / std, (z - farthest[index]) / std
-        is_seen = inside & (z > NEAREST_DEPTH) & (nearest[index] > 0)
-        widest = jnp.maximum(jnp.abs(before), jnp.abs(behind))
-        return jnp.maximum(before, 0.0) - jnp.maximum(behind, 0.0), widest, is_seen, index
-
-    return jax.vmap(gap)((looks.depth, looks.T_previous_look.wxyz_xyz))
 
 
 def _box_sum(values: Float[Array, "p"], camera: Camera, radius: int) -> Float[Array, "p"]:

@@ -24,7 +24,7 @@ from emgs_jax.gaussian_map import (
 from emgs_jax.gaussians import FitConfig, GaussianIndex, Gaussians, cluster, index_of, spacing
 from emgs_jax.initialization import initialize
 from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
-from emgs_jax.motion import Looks, MotionConfig, find_movers, look_again, no_looks, shown_lately
+from emgs_jax.motion import Looks, MotionConfig, find_movers, look_again, no_looks
 from emgs_jax.observation import (
     Observation,
     ObservationConfig,
@@ -269,7 +269,7 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
     refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement)
     new = NewGaussians(fresh, weight, fused.halves)
-    map, num_gaussians, overflow, time = _store(state, replace(submap, map=refined), new, frame, view, config)
+    map, num_gaussians, overflow, time = _store(state.map, replace(submap, map=refined), new, frame, view, config)
 
     info = StepInfo(
         T_world_camera=frame.T_world_camera,
@@ -393,7 +393,7 @@ _refine = executable(refine)
 
 @executable
 def _store(
-    state: SlamState,
+    map: GaussianMap,
     submap: Submap,
     new: NewGaussians,
     frame: Frame,
@@ -402,19 +402,12 @@ def _store(
 ) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
     """Write the submap back, existence updated and duplicates merged; put new Gaussians and halves into free rows.
 
-    Args:
-        state: before the frame.
-
     Returns:
         The map, the number of its Gaussians, how many did not fit, and the time of the next frame.
     """
     rows, T, noise = submap.rows, frame.T_world_camera, frame.localization.depth_noise
-    evidence, map = fusion_evidence(state.map, submap.map, rows), write_back(state.map, submap.map, rows)
-    look = Look(frame.seen, T, view, noise)
-    if state.looks is not None:
-        before, means = state.T_world_previous.inverse(), map.gaussians.means
-        look = look._replace(leaves=shown_lately(state.looks, means, before, state.estimate, view, config.motion))
-    map, is_seen = update_existence(map, evidence, look, config.existence)
+    evidence, map = fusion_evidence(map, submap.map, rows), write_back(map, submap.map, rows)
+    map, is_seen = update_existence(map, evidence, Look(frame.seen, T, view, noise), config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
     merged = merge_duplicates(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
     born = new_map(new.gaussians, _first_weight(new.weight, config.em.average), config.existence.birth, frame.time)

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scene import device, on_host, pose, replace
 
-from emgs_jax.motion import Looks, find_movers, look_again, no_looks, shown_lately
+from emgs_jax.motion import Looks, find_movers, look_again, no_looks
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.pose_estimate import exact_estimate
@@ -15,7 +15,7 @@ WALL, NUM_LOOKS = np.full((48, 64), 3.0), 12
 ROWS, COLUMNS = np.indices((48, 64))
 BLOCK = (abs(ROWS - 24) < 12) & (abs(COLUMNS - 30) < 9)
 NOTHING = np.zeros((48, 64), bool)
-moved, looked, lately = (on_host(f) for f in (find_movers, look_again, shown_lately))
+moved, looked = (on_host(f) for f in (find_movers, look_again))
 
 
 @pytest.fixture(scope="module")
@@ -98,18 +98,6 @@ def test_free_space_decides_what_moves(case, settings):
     kernel = np.lib.stride_tricks.sliding_window_view(np.pad(expected, 2, mode="edge"), (5, 5))
     is_sure = kernel.all((2, 3)) | ~kernel.any((2, 3))  # the outline may be either
     np.testing.assert_array_equal(said[is_sure], expected[is_sure])
-
-
-@pytest.mark.parametrize(
-    ("views", "is_shown"),
-    [([HERE] * 5, True), ([HERE] * 5 + [WALL] * 2, True), ([HERE] * 5 + [WALL] * 3, False), ([WALL] * 5, False)],
-    ids=["still there", "just gone", "gone for long", "never there"],
-)
-def test_what_leaves_was_shown_lately(views, is_shown, settings):
-    estimate = replace(exact_estimate(), depth_noise=device(0.02), covariance=device(np.zeros((7, 7))))
-    places = device([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0], [9.0, 0.0, 2.0], [0.0, 0.0, -2.0]])
-    found = lately(after(views, settings), places, pose(), estimate, CAMERA, settings)
-    np.testing.assert_array_equal(found, [is_shown, not all(view is HERE for view in views[-3:]), False, False])
 
 
 def test_a_camera_that_turns_and_a_map_that_moves_change_nothing_and_an_untracked_frame_is_no_look(settings):

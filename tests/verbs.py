@@ -265,10 +265,6 @@ VERBS = {
         lambda k, o, T, b: motion.find_movers(k, o, T, b, CAMERA, MOTION),
         lambda s: (looks_of(s), sc.observe_room(sc.path_pose(2 + s), CAMERA, 2), looking(s), belief_of(s)),
     ),
-    "shown_lately": (
-        lambda k, p, T, b: motion.shown_lately(k, p, T, b, CAMERA, MOTION),
-        lambda s: (looks_of(s), points(s).points, looking(s), belief_of(s)),
-    ),
     "num_independent": (
         lambda e, p: noise.num_independent(e, p, jnp.arange(40) % 3 > 0),
         lambda s: (points(s).colors[:, 0], points(s).points),
