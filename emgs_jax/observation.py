@@ -57,7 +57,7 @@ class Prediction(eqx.Module):
 
 def no_covariance() -> Float[Array, "2 6 6"]:
     """`Prediction.pose_covariance` where the prior does not say how sure it is."""
-    return jnp.full((2, 6, 6), jnp.nan)
+    return jnp.full((2, 6, 6), jnp.nan, jnp.float32)  # not of a weak type, which is another program
 
 
 def unknown_scale() -> Float[Array, ""]:

@@ -25,10 +25,15 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
     """Raise what the signal stands for; a little later where Python would print that and go on, but not for ever."""
     _delays[number] += 1
     if _is_lost(frame) and _delays[number] < MOST:
-        threading.Timer(AGAIN, os.kill, (os.getpid(), number)).start()
+        threading.Timer(AGAIN, _send, (number,)).start()
     else:
         _delays[number] = 0
         raise RAISED[signal.Signals(number)]
+
+
+def _send(number: int) -> None:
+    """Send this process a signal; os.kill of Windows would end it."""
+    signal.raise_signal(number) if os.name == "nt" else os.kill(os.getpid(), number)
 
 
 def _is_lost(frame: FrameType | None) -> bool:

@@ -16,10 +16,14 @@ from emgs_jax.config.configure import baseline_configs, build, build_dataset, bu
 from emgs_jax.config.values import check_values
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
+from emgs_jax.device.executables import compiling
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
+from emgs_jax.io.bar import Bar
 from emgs_jax.io.files import FrameLog, owned
 from emgs_jax.io.packages import extra
+from emgs_jax.mapping.capacity import prepared_beside
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
+from emgs_jax.mapping.convert import to_camera
 from emgs_jax.mapping.pipeline import finish_run, map_frames
 from emgs_jax.mapping.records import FrameRecord, show_records, to_line
 from emgs_jax.mapping.run import MappingRun, new_run
@@ -69,6 +73,9 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             graph, fused = graph_config(config), baseline_configs(config)
             dataset = build_dataset(config, folder)
             prior = build_prior(config, dataset)
+            if config.map is None:  # which has a capacity of its own
+                num_features = prior.text_features.shape[-1]
+                stack.enter_context(prepared_beside(to_camera(dataset), num_features, slam))
             prior.keep(folder)
             saved = load_saved_map(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
             session = new_run(dataset, slam, clock, graph=graph, saved=saved)
@@ -113,7 +120,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     with clock.phase("report"):
         recorded = read_run(folder)
     if fitting is not None:
-        with _said(clock, "polish", "fitting splats to the images"):
+        tqdm.write("fitting splats to the images …")
+        with clock.phase("polish"):
             notes = [*notes, *polish_lines(polish(recorded, dataset, fitting, densify))]
     with _said(clock, "report", f"writing {REPORT_FILE}"):
         write_report(recorded, dataset)
@@ -128,10 +136,10 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _said(clock: Clock, phase: str, words: str) -> Iterator[None]:
-    """A phase of a run that says what it does before it does it; no words, no line."""
+    """A phase of a run that says what it does before it does it, and for how long; no words, no line."""
     if words:
         tqdm.write(f"{words} …")
-    with clock.phase(phase):
+    with clock.phase(phase), Bar(bar_format="  {elapsed}{postfix}", leave=False, disable=not words, doing=compiling):
         yield
 
 
@@ -148,7 +156,10 @@ def _map(
     if keeper.found is not None:
         tqdm.write(f"going on after frame {len(keeper.found.records)}: those before are read and predicted only")
     run, (baselines, evaluation, keeps_points) = start, compared
-    with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
+    with (
+        FrameLog(folder / "frames.jsonl") as log,
+        Bar(total=len(dataset), unit="frame", desc="mapping", doing=compiling) as bar,
+    ):
 
         def frames() -> Iterator[tuple[FrameRecord, RawView]]:
             nonlocal run

@@ -2,6 +2,7 @@
 
 import importlib.util
 import re
+import shlex
 import subprocess
 import sys
 from functools import cache
@@ -10,6 +11,11 @@ from pathlib import Path
 import pytest
 from omegaconf import OmegaConf
 from scene import CONF, compose
+
+import emgs_jax
+from emgs_jax.config.overrides import readable
+from experiments.command import check_arguments
+from experiments.evaluate import delegated
 
 ROOT = CONF.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -54,6 +60,32 @@ def test_commands_options_and_files_are_there(page):
     assert not re.search(r"=-?\.(inf|nan)", code(page))
 
 
+def commands(page: Path) -> set[tuple[str, ...]]:
+    """Name of each command of a page and its overrides, without those that are left to the reader ("…")."""
+    found = set()
+    for part in re.split(r"&&|\n", code(page).replace("\\\n", " ")):
+        part = part.replace("python -m experiments.", "emgs ")
+        if re.match(r"\s*emgs [a-z]", part) and "$PWD" not in part:
+            _, name, *words = shlex.split(part, comments=True)
+            given = [word for word in words if "=" in word and "…" not in word]
+            if name == "run" and words and re.fullmatch(r"[\w/.]+", words[0]):  # what a video stands for
+                given = ["dataset=images", "prior=multiview_stereo", *given]
+            if name == "evaluate":
+                has_suite = any(word.startswith("suite=") for word in given)
+                given = delegated(given if has_suite else ["suite=smoke", *given])
+            found.add((name, *given))
+    return found
+
+
+@pytest.mark.slow
+@pages
+def test_every_command_composes_its_config(page):
+    """Keys, options and their values: those of what is named here, `mine/` aside, which test_extending.py runs."""
+    for name, *words in commands(page):
+        if words:
+            check_arguments("config" if name == "run" else name, readable(words))
+
+
 @pages
 def test_keys_of_the_stages_are_keys_of_the_config(page):
     """A key has a value after it, or is the whole span."""
@@ -90,7 +122,7 @@ def test_instructions_are_short_and_have_no_history():
         assert not re.search(r"`(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,12}`", text), page
 
 
-def test_the_site_builds_without_a_warning_and_has_every_key(tmp_path):
+def test_the_site_builds_without_a_warning_and_has_every_key_and_name(tmp_path):
     """As `mkdocs build --strict` does: every link and anchor is there, and so is every page of the navigation."""
     pytest.importorskip("mkdocs")
     words = ["build", "--strict", "--quiet", "--config-file", str(ROOT / "mkdocs.yml"), "--site-dir", str(tmp_path)]
@@ -98,3 +130,5 @@ def test_the_site_builds_without_a_warning_and_has_every_key(tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     keys = (tmp_path / "keys.html").read_text()
     assert all(str(path.relative_to(CONF)) in keys for path in CONF.rglob("*.yaml"))
+    names = (tmp_path / "names.html").read_text()
+    assert all(f'id="{name.lower()}"' in names for name in emgs_jax.__all__ if name != "__version__")

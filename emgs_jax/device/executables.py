@@ -18,7 +18,8 @@ import platform
 import re
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from functools import cache, partial
 from importlib.metadata import version
 from pathlib import Path
@@ -42,6 +43,8 @@ _OPTIONS = {"xla_embed_ir_in_executable": False}, {"xla_dump_hlo_as_text": False
 _loaded: dict[tuple, Callable] = {}
 _seen: dict[tuple, tuple] = {}  # what this process has traced: a function and classes, and their fingerprint
 _thread = threading.local()  # `hits`: executables that JAX took from its cache
+_making: dict[int, str] = {}  # thread -> the function that it compiles
+_counted = [0, 0]  # of the stages that are made side by side: those that are done, and all
 
 
 def call(function: Callable, *arguments: Any) -> Any:
@@ -71,12 +74,49 @@ def ready(function: Callable, *arguments: Any) -> Callable | None:
     return _loaded[key]
 
 
+@contextlib.contextmanager
+def making(function: Callable) -> Iterator[None]:
+    """Say inside that a function is compiled in this thread."""
+    thread = threading.get_ident()
+    _making[thread] = function.__wrapped__.__name__.strip("_")
+    try:
+        yield
+    finally:
+        _making.pop(thread, None)
+
+
+def make_all(make: Callable, calls: Sequence[tuple[Callable, tuple]]) -> None:
+    """`make(function, arguments)` for all of them, on as many cores as there are."""
+
+    def count(call: tuple[Callable, tuple]) -> None:
+        make(*call)
+        _counted[0] += 1
+
+    _counted[:] = 0, len(calls)
+    try:
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            list(threads.map(count, calls))
+    finally:
+        _counted[:] = 0, 0
+
+
+def compiling() -> str:
+    """What is compiled now, in words; "" where nothing is."""
+    names, (done, whole) = ", ".join(sorted({*_making.values()})), _counted
+    if not names:
+        return ""
+    return f"compiling stage {min(done + 1, whole)} of {whole}, once: {names}" if whole else f"compiling {names}, once"
+
+
 def outputs(function: Callable, *arguments: Any) -> Any:
     """`eqx.filter_eval_shape`, which traces the function, or what is kept of that."""
     leaves, tree = jax.tree.flatten(arguments)
     is_kept = _written(function, tree) is not None and _folder() is not None
     entry = _entry(_digest(function, tree, tuple(map(_about, leaves)))) if is_kept else None
-    return eqx.filter_eval_shape(function, *arguments) if entry is None else rebuilt(entry["outputs"])
+    if entry is not None:
+        return rebuilt(entry["outputs"])
+    with making(function):
+        return eqx.filter_eval_shape(function, *arguments)
 
 
 def forget() -> None:
@@ -90,7 +130,7 @@ def forget_replaced() -> None:
 
     JAX would go on with what the function was when it was first called with arrays of these shapes.
     """
-    if any(fingerprint(*things) != before for things, before in dict(_seen.values()).items()):
+    if any(fingerprint(*things) != before for things, before in dict(list(_seen.values())).items()):
         forget()
         jax.clear_caches()
 
@@ -135,7 +175,10 @@ def _made(function: Callable, arguments: tuple, digest: str) -> Callable:
     """The executable of an entry, or of a new one where it is missing, damaged or refused."""
     entry = _entry(digest)
     found = None if entry is None else _runnable(entry["program"], function, arguments, rebuilt(entry["outputs"]))
-    return _compile(function, arguments, digest) if found is None else found
+    if found is not None:
+        return found
+    with making(function):
+        return _compile(function, arguments, digest)
 
 
 def _compile(function: Callable, arguments: tuple, digest: str) -> Callable:

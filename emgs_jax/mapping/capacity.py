@@ -1,9 +1,10 @@
 """Capacity of maps on the host: executables for it, and its doubling where a map or submap is full."""
 
-import os
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from threading import Event, Lock
 from typing import Any
 
 import equinox as eqx
@@ -13,12 +14,12 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.device.arrays import on_device
-from emgs_jax.device.executables import call, outputs, ready
+from emgs_jax.device.executables import call, make_all, making, outputs, ready
 from emgs_jax.device.fingerprint import fingerprint
 from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.motion import no_looks
-from emgs_jax.observation import Prediction, no_covariance, transform, unknown_scale
+from emgs_jax.observation import Observation, Prediction, no_covariance, observe, transform, unknown_scale
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
 from emgs_jax.ops.precision import full_precision
@@ -28,6 +29,7 @@ from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state,
 _insert = eqx.filter_jit(insert)
 _init, _step = (calling(call)(function) for function in (init_state, step))  # by executables that are kept
 _prepared: set[tuple] = set()  # steps and shapes that this process has compiled
+_preparing = Lock()
 
 
 def start(
@@ -77,14 +79,17 @@ def add_map(map: GaussianMap, other: GaussianMap, config: SlamConfig) -> tuple[G
     return both, config
 
 
-def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None:
+def prepare_step(
+    views: Observation, camera: Camera, config: SlamConfig, is_wanted: Callable[[], bool] = lambda: True
+) -> None:
     """Load or compile the executables of `step` side by side, which takes as many cores as there are.
 
     Where none are kept each is called once, with zeros; what a process has already is not called again.
 
     Args:
-        first: whose shapes the observations of the sequence have.
+        views: observations of the sequence, stacked, or their shapes.
         camera: of the full images.
+        is_wanted: asked before each executable; where it is not, the rest is left.
     """
     calls: list[tuple[Callable, tuple]] = []
 
@@ -92,7 +97,7 @@ def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None
         calls.append((executable, arguments))
         return _zeros(outputs(executable, *arguments))
 
-    view = _zeros(jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), first.views))
+    view = _zeros(jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), views))
     pose, poses = (jaxlie.SE3(on_device(np.eye(1, 7, dtype=np.float32).repeat(n, 0).squeeze())) for n in (1, 3))
     unknown = on_device(np.bool_(False))
     prediction = Prediction(
@@ -108,21 +113,45 @@ def prepare_step(first: FirstWindow, camera: Camera, config: SlamConfig) -> None
     map = _zeros(jax.eval_shape(lambda: empty_map(config.submap.map_capacity, view.features.shape[-1])))
     shapes = tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))
     key = fingerprint(step), jax.tree.structure((map, view, config)), shapes
-    if key in _prepared:
-        return
-    looks = _zeros(jax.eval_shape(lambda: no_looks(view, config.motion)))
-    state = SlamState(map, view, pose, _zeros(jax.eval_shape(exact_estimate)), on_device(np.int32(0)), looks)
-    with calling(note):
-        step(state, prediction, camera, config)
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
-        list(threads.map(lambda noted: _prepare(*noted), calls))
-    _prepared.add(key)
+    with _preparing:  # one that began beside the prediction may not have ended
+        if key in _prepared:
+            return
+        looks = _zeros(jax.eval_shape(lambda: no_looks(view, config.motion)))
+        state = SlamState(map, view, pose, _zeros(jax.eval_shape(exact_estimate)), on_device(np.int32(0)), looks)
+        with calling(note):
+            step(state, prediction, camera, config)
+        make_all(lambda *noted: is_wanted() and _prepare(*noted), calls)
+        if is_wanted():
+            _prepared.add(key)
+
+
+@contextlib.contextmanager
+def prepared_beside(camera: Camera, num_features: int, config: SlamConfig) -> Iterator[None]:
+    """`prepare_step` in the background of a block, which reads and predicts the first frames meanwhile.
+
+    Args:
+        camera: of the full images.
+        num_features: width of the prior's features; if it is another, the step is compiled for that one when it comes.
+            Any error comes back there, too.
+    """
+    h, w = camera.height, camera.width
+    sizes = ((h, w, 3), "float32"), ((h, w, 3), "float32"), ((h, w, num_features), "float32"), ((h, w), "float32")
+    image = (jax.ShapeDtypeStruct((1, *size), kind) for size, kind in (*sizes, ((h, w), "bool")))
+    views = jax.eval_shape(jax.vmap(lambda *arrays: observe(*arrays, config.observation)), *image)
+    ended = Event()
+    with ThreadPoolExecutor(1, "compilation") as thread:
+        thread.submit(prepare_step, views, camera, config, lambda: not ended.is_set())
+        try:
+            yield
+        finally:
+            ended.set()
 
 
 @full_precision  # as inside `step`: else it is another
 def _prepare(executable: Callable, arguments: tuple) -> None:
     if ready(executable, *arguments) is None:
-        jax.block_until_ready(executable(*arguments))
+        with making(executable):
+            jax.block_until_ready(executable(*arguments))
 
 
 def _of_map(overflow: jax.Array) -> Overflow:

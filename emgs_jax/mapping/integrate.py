@@ -73,7 +73,7 @@ def place(atlas: Atlas, window: WindowInput) -> tuple[Atlas, Event, Found | None
     if window.prediction is None:
         return atlas, lost_event(atlas, window), None
     if isinstance(window.prediction, FirstWindow):
-        prepare_step(window.prediction, atlas.camera, atlas.config)
+        prepare_step(window.prediction.views, atlas.camera, atlas.config)
     atlas = return_to_world(atlas, window)
     started = begin(atlas, window)
     if started is not None:

@@ -28,8 +28,8 @@ from scene import (
 
 from emgs_jax import em
 from emgs_jax.device import executable_files, executables
-from emgs_jax.device.executables import call, outputs, ready, stored
-from emgs_jax.mapping.capacity import start
+from emgs_jax.device.executables import call, compiling, make_all, outputs, ready, stored
+from emgs_jax.mapping.capacity import _prepare, start
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.executable import calling
 from emgs_jax.ops.pytree import stack
@@ -92,6 +92,21 @@ def test_what_was_kept_gives_the_same_bits_in_the_same_structure_and_traces_noth
     shapes = outputs(function, *arguments())
     assert jax.tree.structure(shapes) == jax.tree.structure(expected) and not TRACES
     assert_same(stored(looked_at)(*arguments()), expected)
+
+
+def told(points):
+    TRACES.append(compiling())
+    return 2 * points
+
+
+@pytest.mark.parametrize("is_kept", [True, False])
+def test_who_waits_is_told_what_is_compiled_and_how_many_stages_there_are(folder, is_kept):
+    jax.config.update("jax_compilation_cache_dir", str(folder) if is_kept else None)
+    stages = [(eqx.filter_jit(told), (jnp.ones(size),)) for size in (2, 3)]
+    make_all(lambda *stage: _prepare(*stage), stages)
+    assert {said.partition(" of ")[2] for said in TRACES} == {"2, once: told"} and compiling() == ""
+    call(eqx.filter_jit(told), jnp.ones(4))
+    assert TRACES[-1] == ("compiling told, once" if is_kept else "")
 
 
 @pytest.mark.parametrize("change", ["shape", "static", "number", "precision", "weak type"])

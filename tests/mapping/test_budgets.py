@@ -11,6 +11,7 @@ import jax
 import jax.monitoring
 import pytest
 from jax.experimental.compilation_cache import compilation_cache
+from listening import compiled
 from tiny_run import NUM_FRAMES, compose, make_exact_run
 
 import experiments.run
@@ -47,9 +48,10 @@ def runs(tmp_path_factory, shared_folder):
             compilation_cache.reset_cache()
             reads.clear()
             out = tmp_path_factory.mktemp(name)
-            with counted() as events:
+            with counted() as events, compiled() as names:
                 metrics = experiments.run.run(compose("prior.level=0"), out)
-            found[name] = SimpleNamespace(folder=out, metrics=metrics, events=events, reads=Counter(reads))
+            about = {"events": events, "reads": Counter(reads), "names": Counter(names)}
+            found[name] = SimpleNamespace(folder=out, metrics=metrics, **about)
     jax.config.update("jax_compilation_cache_dir", before)
     compilation_cache.reset_cache()
     make_exact_run(shared_folder, found["cold"].folder)
@@ -73,6 +75,15 @@ def test_a_run_makes_no_more_executables_than_it_did(runs):
     A further one costs .05 to .5 s of every first run, so who adds some says why here.
     """
     assert runs.cold.events["compile_requests_use_cache"] <= 38
+
+
+def test_nothing_is_compiled_twice(runs):
+    """What is prepared is what a step takes: the coarse pose was compiled again for a type that differed.
+
+    The host puts one pose and those of all frames on the device; JAX's own operations on arrays are small.
+    """
+    twice = {name for name, count in runs.cold.names.items() if count > 1}
+    assert twice <= {"_poses", "true_divide", "stage", "convert_element_type"}
 
 
 def test_a_frame_is_read_once(runs):

@@ -27,7 +27,7 @@ def prepared(camera):
     jax.clear_caches()
     forget()
     with compiled() as names:
-        prepare_step(first, FULL, config)
+        prepare_step(first.views, FULL, config)
     return *start(first, FULL, config), names
 
 
