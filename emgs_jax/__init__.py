@@ -37,6 +37,7 @@ if TYPE_CHECKING:  # for editors and type checkers, and the list of names
         insert,
         new_map,
         select_submap,
+        transformed,
         write_back,
     )
     from emgs_jax.gaussians import FitConfig, Gaussians, cluster, fit_to_points

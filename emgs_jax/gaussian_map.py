@@ -1,15 +1,19 @@
 """The map M: Gaussians of fixed capacity with the weight of their running average, and its submaps."""
 
 import math
+from dataclasses import fields
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussians import Gaussians, blend, empty_gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.ops.neighbours import compact_rows
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
 
 
@@ -85,6 +89,56 @@ def new_map(
 def confirmed(map: GaussianMap) -> Gaussians:
     """The Gaussians with only the confirmed ones valid."""
     return eqx.tree_at(lambda g: g.valid, map.gaussians, map.gaussians.valid & (map.existence > 0))
+
+
+@full_precision
+def transform_rows(
+    map: GaussianMap,
+    means: Float[Array, "n 3"],
+    turn: Float[Array, "*#n 3 3"],
+    scale: Float[Array, "*#n"],
+    min_std: Float[Array, ""] | float = 0.0,
+) -> GaussianMap:
+    """Apply a similarity to each Gaussian, one or its own: Σ' = s² R (Σ - min_std² I) Rᵀ + min_std² I.
+
+    Args:
+        means: where the similarities bring the means, world frame.
+        turn: R.
+        scale: s.
+        min_std: m; floor of the covariances that is no length of the scene, as deformed maps have one.
+
+    Raises:
+        KeyError: a field of the map has no rule here.
+    """
+
+    def shapes(covs: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
+        floor = min_std**2 * jnp.eye(3)
+        turned = jnp.einsum("...ij,...jk,...lk->...il", turn, covs - floor, turn)
+        return scale[..., None, None] ** 2 * (0.5 * (turned + turned.mT)) + floor  # as equal as roundings were not
+
+    def same(values: Array) -> Array:
+        return values
+
+    rules = {
+        "means": lambda _: means,
+        "covs": shapes,
+        "normals": lambda normals: jnp.einsum("...ij,...j->...i", turn, normals),
+        **dict.fromkeys(("colors", "features", "valid", "weight", "num_updates", "existence", "birth"), same),
+    }
+
+    def moved(part: Any) -> Any:
+        return type(part)(**{field.name: rules[field.name](getattr(part, field.name)) for field in fields(part)})
+
+    rules["gaussians"] = moved
+    return moved(map)
+
+
+@full_precision
+def transformed(map: GaussianMap, scale: float, rotation: ArrayLike, translation: ArrayLike) -> GaussianMap:
+    """Apply one similarity y = s R x + t to a whole map; free rows stay neutral."""
+    s, R, t = (jnp.asarray(value, jnp.float32) for value in (scale, rotation, translation))
+    means = s * jnp.einsum("ij,nj->ni", R, map.gaussians.means) + t
+    return where_rows(map.gaussians.valid, transform_rows(map, means, R, s), map)
 
 
 def without(map: GaussianMap, is_gone: Bool[Array, "n"]) -> GaussianMap:

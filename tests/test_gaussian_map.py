@@ -6,8 +6,18 @@ import numpy as np
 import pytest
 import reference
 import scene as sc
+from hand_run import random_similarity
 
-from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert, select_submap, update_average, write_back
+from emgs_jax.gaussian_map import (
+    GaussianMap,
+    empty_map,
+    grow,
+    insert,
+    select_submap,
+    transformed,
+    update_average,
+    write_back,
+)
 from emgs_jax.gaussians import empty_gaussians
 
 update, select, inserted_into, written = (sc.on_host(f) for f in (update_average, select_submap, insert, write_back))
@@ -203,3 +213,30 @@ def test_growing_keeps_every_row_and_adds_free_neutral_ones():
     grown = grow(map, 16)
     sc.assert_same(sc.rows_of(grown, slice(8)), map)
     sc.assert_same(sc.rows_of(grown, slice(8, None)), empty_map(8, 0))
+
+
+def test_a_similarity_keeps_what_a_map_says_of_every_point():
+    """Mahalanobis distances and sides of surfaces are the same; free rows stay neutral, and what has no length too."""
+    moved, rng = random_similarity(np.random.default_rng(1), 1.7), np.random.default_rng(2)
+    new, points = transformed(MAP, **vars(moved)), rng.normal(size=(200, 3))
+
+    def seen(map: GaussianMap, at: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        rows = jax.tree.map(lambda leaf: np.asarray(leaf[:200], np.float64), map.gaussians)
+        offsets = at - rows.means
+        sides = np.einsum("ni,ni->n", offsets, rows.normals)
+        return np.einsum("ni,nij,nj->n", offsets, np.linalg.inv(rows.covs), offsets), sides
+
+    (distance, side), (new_distance, new_side) = seen(MAP, points), seen(new, moved.apply(points))
+    np.testing.assert_allclose(new_distance, distance, rtol=1e-4)  # of inverses in float32
+    np.testing.assert_allclose(new_side, 1.7 * side, atol=1e-5)
+    sc.assert_same(sc.rows_of(new, np.arange(256) >= 200), sc.rows_of(MAP, np.arange(256) >= 200))
+    for name in ("weight", "num_updates", "existence", "birth"):
+        np.testing.assert_array_equal(getattr(new, name), getattr(MAP, name))
+
+
+def test_a_field_of_which_nobody_says_how_it_moves_stops_every_similarity():
+    class Tagged(GaussianMap):
+        tag: jax.Array
+
+    with pytest.raises(KeyError, match="tag"):
+        transformed(Tagged(**vars(MAP), tag=MAP.weight), **vars(random_similarity(np.random.default_rng(0), 1.0)))

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from emgs_jax.back_end.state import transform_nodes
 from emgs_jax.device.arrays import on_device
 from emgs_jax.device.executables import stored
-from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussian_map import transform_rows
 from emgs_jax.geometry import Sim3, seen_from
 from emgs_jax.localization import LocalizationConfig
 from emgs_jax.mapping.atlas import Atlas, with_state
@@ -114,15 +114,10 @@ def _rescaled(state: SlamState, factor: Float[Array, ""], center: Float[Array, "
     def placed(points: jnp.ndarray) -> jnp.ndarray:
         return center + factor * (points - center)
 
-    def grown(map: GaussianMap) -> GaussianMap:
-        gaussians = map.gaussians
-        lengths = placed(gaussians.means), factor**2 * gaussians.covs
-        return eqx.tree_at(lambda m: (m.gaussians.means, m.gaussians.covs), map, lengths)
-
     T = state.T_world_previous
     return replace(
         state,
-        map=grown(state.map),
+        map=transform_rows(state.map, placed(state.map.gaussians.means), jnp.eye(3), factor),
         previous=eqx.tree_at(lambda o: o.points, state.previous, placed(state.previous.points)),
         T_world_previous=jaxlie.SE3.from_rotation_and_translation(T.rotation(), placed(T.translation())),
         estimate=rescale_estimate(state.estimate, factor),

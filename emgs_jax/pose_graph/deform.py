@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussian_map import GaussianMap, transform_rows
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
@@ -74,13 +74,7 @@ def deform(
     share = counts / jnp.sum(counts, axis=-1, keepdims=True)
     means = jnp.einsum("nk,nki->ni", share, motions(gaussians.means[:, None]))
     scale = jnp.exp(jnp.sum(share * jnp.log(motions.scale), axis=-1))
-    turn = _mean_turn(motions.turn, share).as_matrix()
-    floor = min_std**2 * jnp.eye(3)
-    shapes = jnp.einsum("nij,njk,nlk->nil", turn, gaussians.covs - floor, turn)
-    shapes = 0.5 * (shapes + shapes.mT)  # as equal as roundings were not
-    normals = jnp.einsum("nij,nj->ni", turn, gaussians.normals)
-    changed = means, scale[:, None, None] ** 2 * shapes + floor, normals
-    moved = eqx.tree_at(lambda g: (g.means, g.covs, g.normals), gaussians, changed)
+    moved = transform_rows(map, means, _mean_turn(motions.turn, share).as_matrix(), scale, min_std).gaussians
     has_moved = jnp.any(motions.has_moved & (counts > 0), axis=-1)
     moved = where_rows(has_moved & gaussians.valid, moved, gaussians)
     return eqx.tree_at(lambda m: m.gaussians, map, moved)

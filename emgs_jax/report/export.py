@@ -6,11 +6,10 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import cv2
-import equinox as eqx
 import numpy as np
 
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.gaussian_map import transformed
 from emgs_jax.geometry import Sim3
 from emgs_jax.io.cameras import save_colmap, save_frustums, save_transforms
 from emgs_jax.io.files import new_folder, write_json
@@ -188,20 +187,10 @@ def write_scaled(run: RecordedRun, folder: Path, factor: float) -> RecordedRun:
         if (run.folder / name).is_file():
             times, poses = load_trajectory_tum(run.folder / name)
             save_trajectory_tum(folder / name, times, unit.apply_to_poses(poses))
-    scaled = replace(run, folder=folder, poses=unit.apply_to_poses(run.poses), map=scaled_map(run.map, factor))
+    scaled = replace(run, folder=folder, poses=unit.apply_to_poses(run.poses), map=transformed(run.map, **vars(unit)))
     save_map(folder / "map.npz", scaled.map)
     for name in CLOUDS:
         if (run.folder / name).is_file():
             scale_ply(run.folder / name, folder / name, factor)
     write_json(folder / "scale.json", {"factor": factor, "of": run.folder.resolve().name})
     return scaled
-
-
-def scaled_map(map: GaussianMap, factor: float) -> GaussianMap:
-    """Scale means and covariances of the valid rows; free rows stay neutral."""
-    gaussians = map.gaussians
-    means = np.asarray(gaussians.means) * np.float32(factor)
-    is_valid = np.asarray(gaussians.valid)[:, None, None]
-    covs = np.where(is_valid, np.asarray(gaussians.covs) * np.float32(factor**2), gaussians.covs)
-    means = np.where(is_valid[..., 0], means, gaussians.means)
-    return eqx.tree_at(lambda m: (m.gaussians.means, m.gaussians.covs), map, (means, covs))
