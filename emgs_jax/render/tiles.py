@@ -125,6 +125,6 @@ def take_chunks(lists: TileLists, begin: Int[Array, ""], count: int) -> Chunks:
     of = jnp.minimum(tiles, last)
     starts = lists.bounds[of] + (numbers - lists.chunks[of]) * CHUNK
     positions = starts[:, None] + jnp.arange(CHUNK)
-    exists = (positions < lists.bounds[of + 1][:, None]) & (tiles <= last)[:, None]
+    exists = positions < lists.bounds[of + 1][:, None]  # past the last tile none is
     # The first exists wherever anything does: what stands for nothing is finite.
     return Chunks(tiles, positions, lists.rows[jnp.where(exists, positions, 0)], exists)

@@ -152,6 +152,21 @@ def test_the_class_of_a_voxel_is_that_of_most_views_and_a_view_counts_once(monke
     assert found.classes == ("a", "b", "c") and len(SpooledLabels(("a",)).points(0.1).labels) == 0
 
 
+def test_classes_of_many_views_are_counted_a_range_of_cells_at_a_time(monkeypatch):
+    """Of 1,000 frames the pairs of all views were sorted at once: gigabytes."""
+    rng, sizes, whole = np.random.default_rng(0), [], segmentation._most_seen
+    seen, found = SpooledLabels(tuple("abcd")), []
+    for _ in range(20):
+        seen.append(rng.uniform(-5.0, 5.0, (500, 3)), rng.integers(0, 4, 500))
+    monkeypatch.setattr(segmentation, "_most_seen", lambda rows: sizes.append(len(rows)) or whole(rows))
+    for most in (500, 500_000):
+        monkeypatch.setattr("emgs_jax.evaluation.clouds._PART_ROWS", most)
+        found.append(seen.points(0.5))
+    assert len(sizes) == 21 and max(sizes[:-1]) < 1500 and sum(sizes[:-1]) == sizes[-1]
+    np.testing.assert_array_equal(found[0].points, found[1].points)
+    np.testing.assert_array_equal(found[0].labels, found[1].labels)
+
+
 def test_labels_are_translated_by_name_and_the_nearest_class_is_by_angle():
     """A class that the others lack stays an answer; a missing feature has none."""
     found = translate(np.array([[0, 1], [2, -1]]), ("chair", "wall", "cat"), ("wall", "chair"))

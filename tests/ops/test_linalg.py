@@ -90,6 +90,14 @@ def test_mahalanobis_is_squared_and_never_negative():
     assert mahalanobis_sq(np.float32([1, 0, 0]), np.float32(-np.eye(3))) == 0
 
 
+def test_a_form_of_lower_entries_is_that_of_the_matrix():
+    covs, vectors = spd(20, 3, (0.1, 0.2, 0.3)), RNG.normal(size=(20, 3))
+    found = on_host(lambda s, v: linalg.quadratic(linalg.lower_entries(s), jnp.unstack(v, axis=-1)))
+    np.testing.assert_allclose(
+        found(*map(np.float32, (covs, vectors))), np.einsum("ni,nij,nj->n", vectors, covs, vectors), rtol=1e-4
+    )
+
+
 def test_a_direction_is_unit_and_zero_without_a_length_with_finite_gradients():
     vectors = np.float32([[3.0, 0, 4], [0, 0, 0], [1e-13, 0, 0], [0, 1e-6, 0], [0, 0, -1e6]])
     expected = [[0.6, 0, 0.8], [0, 0, 0], [0, 0, 0], [0, 1, 0], [0, 0, -1]]
