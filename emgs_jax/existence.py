@@ -38,7 +38,6 @@ class ExistenceConfig(eqx.Module):
         hit: log-odds that a frame adds if the Gaussian explains some of its points.
         miss: log-odds that a frame takes away that sees through the Gaussian (free-space violation), or whose points it
             does not explain.
-        gone: likewise of a frame that sees a surface more than twice as far behind it as that takes.
         max_log_odds: upper limit, so that a bounded number of frames can outweigh any number of earlier ones.
         refuted: log-odds below which a Gaussian is removed; `-inf` never, as printed.
         num_std: k, standard deviations of the depth between a Gaussian and the surface that a frame sees, within which
@@ -56,7 +55,6 @@ class ExistenceConfig(eqx.Module):
     birth: Float[Array, "*b"] = traced(low=-1e6)
     hit: Float[Array, "*b"] = traced(low=0)
     miss: Float[Array, "*b"] = traced(low=0)
-    gone: Float[Array, "*b"] = traced(low=0)
     max_log_odds: Float[Array, "*b"] = traced(low=0)
     refuted: Float[Array, "*b"] = traced(low=-math.inf)
     num_std: Float[Array, "*b"] = traced(low=0)
@@ -138,9 +136,7 @@ def update_existence(
     spread = 0.5 * (jnp.trace(gaussians.covs, axis1=-2, axis2=-1) - variance)  # variance along the surface
     has_points = spread >= (depth / camera.focal[0]) ** 2
     is_superfluous = is_seen & (use < 0) & (has_points | (map.existence <= 0))
-    is_gone = is_seen_through & (depth < nearest - 2.0 * reach)
     change = config.hit * ((use > 0) & ~is_seen_through) - config.miss * (is_seen_through | is_superfluous)
-    change = jnp.where(is_gone, -config.gone, change)
     existence = jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)
     existence = jnp.where(change == 0, map.existence, existence)
     updated = eqx.tree_at(lambda m: m.existence, map, existence)

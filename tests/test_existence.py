@@ -168,15 +168,6 @@ def test_what_is_seen_through_is_not_confirmed_by_what_it_explains(settings):
     np.testing.assert_allclose(after.existence, np.asarray(map.existence) - settings.miss, atol=1e-6)
 
 
-@pytest.mark.parametrize(
-    "depth, change", [(2.0, 0.0), (2.2, -0.35), (3.0, -3.0)], ids=["on it", "behind", "far behind"]
-)
-def test_what_is_gone_goes_within_a_few_looks(settings, depth, change):
-    map, clear = map_of(discs([[0.0, 0.0, 2.0]]), existence=2.0), eqx.tree_at(lambda c: c.gone, settings, device(3.0))
-    after, _ = judged(map, 0, look(depth), HERE, CAMERA, NOISE, clear)
-    assert after.existence[0] == pytest.approx(2.0 + change)
-
-
 def test_usefulness_is_what_a_frame_fused_into_each_row_of_its_submap():
     map, rows = map_of(discs(WALL[:5])), np.array([3, 1, 5])  # the last is padding
     submap = replace(rows_of(map, np.minimum(rows, 4)), num_updates=np.int32([1 + 2, 1, 1 + 1]))
