@@ -44,10 +44,12 @@ if TYPE_CHECKING:  # for editors and type checkers, and the list of names
     from emgs_jax.initialization import initialize
     from emgs_jax.io.map_file import load_map, save_map
     from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
+    from emgs_jax.mapping.atlas import Atlas
     from emgs_jax.mapping.capacity import advance, start
     from emgs_jax.mapping.convert import FirstWindow, opening, to_camera, to_first_window, to_prediction
     from emgs_jax.mapping.finalize import in_prior_unit
     from emgs_jax.mapping.integrate import integrate
+    from emgs_jax.mapping.merging import join
     from emgs_jax.mapping.pipeline import finish_run, map_frames
     from emgs_jax.mapping.records import FrameRecord
     from emgs_jax.mapping.run import MappingRun, new_run

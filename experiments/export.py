@@ -12,9 +12,10 @@ from emgs_jax.io.files import check_writable, new_folder, owned
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.export import IMAGE_FORMATS, ExportConfig, export, find_factor, write_scaled
 from emgs_jax.report.recorded_run import RecordedRun, read_run
+from emgs_jax.report.run_images import images_of
 
 from .command import command
-from .report import images_of, positional
+from .report import positional
 
 
 def export_run(config: DictConfig) -> list[Path]:

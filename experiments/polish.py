@@ -11,9 +11,10 @@ from emgs_jax.report.page import write_report
 from emgs_jax.report.polish import polish
 from emgs_jax.report.printout import polish_lines
 from emgs_jax.report.recorded_run import SPLATS_FILE, read_run
+from emgs_jax.report.run_images import images_of
 
 from .command import command
-from .report import images_of, positional
+from .report import positional
 
 
 def polish_run(config: DictConfig) -> dict[str, Any]:

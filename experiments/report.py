@@ -2,16 +2,13 @@
 
 from pathlib import Path
 
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
+from omegaconf import DictConfig
 
-from emgs_jax.config.configure import build_dataset, message_of
 from emgs_jax.config.overrides import KEY, quoted
-from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import check_writable
 from emgs_jax.report.page import write_report
-from emgs_jax.report.recorded_run import RecordedRun, read_run
-from emgs_jax.report.repeat import check_targets
+from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.run_images import images_of
 
 from .command import command
 
@@ -24,23 +21,6 @@ def report(folder: Path) -> Path:
     path = write_report(run, dataset, note)
     print(f"{path}: {path.stat().st_size / 1e6:.1f} MB" + (f"\n{note}" if note else ""))
     return path
-
-
-def images_of(run: RecordedRun) -> tuple[ReadableFrames | None, str]:
-    """The data set of a run, or why there is none; raises ValueError where settings name other code than ours."""
-    settings, count = run.provenance["config"], len(run.poses)
-    check_targets(settings["dataset"])
-    try:
-        dataset = build_dataset(OmegaConf.create(dict(settings)))
-    except OmegaConfBaseException as error:  # a key of ours that the settings of older code do not have
-        return None, f"The images are not shown: the run is of another version ({str(error).splitlines()[0]})."
-    except (ValueError, OSError) as error:
-        return None, f"The images are not shown: {message_of(error)}"
-    if len(dataset) != count:
-        return None, f"The images are not shown: there are {len(dataset)} now, and {count} were mapped."
-    if dataset.fingerprint() != run.provenance["data"]["fingerprint"]:
-        return None, "The images are not shown: they are not those that were mapped."
-    return dataset, ""
 
 
 def positional(arguments: list[str]) -> list[str]:

@@ -13,12 +13,12 @@ from emgs_jax.data.class_file import read_classes
 from emgs_jax.evaluation.segmentation import DistinctCells, LabelledPoints, label_cells, read_labelled_mesh, true_labels
 from emgs_jax.io.files import write_file, write_json
 from emgs_jax.report.recorded_run import RecordedRun, read_run
+from emgs_jax.report.run_images import images_of
 from emgs_jax.report.segmentation_table import Placement, SceneResult, score_scene, summary, table
 from emgs_jax.report.vocabulary import feature_model, vocabulary
 
 from .command import command
 from .keys import check_keys
-from .report import images_of
 
 FRAMES = "frames"  # the word that takes the labels of the data set's own frames for truth
 

@@ -40,6 +40,22 @@ def detect_loops(end: BackEnd, frame: FrameData) -> BackEnd:
     return end
 
 
+def detect_loops_between(end: BackEnd, submap_id: int) -> BackEnd:
+    """Verify loops of all keyframes of a submap, whose unit may be another, with those of the active one.
+
+    Its nodes come after those of the active one.
+    """
+    config, is_placed = end.config.place_recognition, [end.nodes[one.frame].is_placed for one in end.database.keyframes]
+    known, queries = (
+        [row for row, ok in enumerate(is_placed) if ok and _submap_id_of(end, row) == number]
+        for number in (end.active, submap_id)
+    )
+    for row in queries:
+        for candidate in most_similar(end.database, end.database.keyframes[row], known, config.num_candidates, config):
+            end = _verify_candidate(end, row, candidate.row, is_free=True)
+    return end
+
+
 def recent_loops(end: BackEnd) -> list[LoopMeasurement]:
     """Select spatially consistent loops of the last queries that are not in the pose graph yet, after a keyframe."""
     time = len(end.nodes) - 1
@@ -115,13 +131,13 @@ def remove_inconsistent(end: BackEnd) -> BackEnd:
     return replace(end, accepted=accepted, factors=factors)
 
 
-def _verify_candidate(end: BackEnd, row: int, other: int) -> BackEnd:
+def _verify_candidate(end: BackEnd, row: int, other: int, is_free: bool = False) -> BackEnd:
     """Verify a loop between two keyframes, rows of the database, the later first, and record the outcome."""
     keyframes = end.database.keyframes
     candidate, rows = keyframes[other], (k for k in (other - 1, other + 1) if 0 <= k < row)
     beside = [keyframes[k] for k in rows if _submap_id_of(end, k) == end.active]
     neighbours = neighbours_of(candidate, beside, end.poses, end.log_scales)
-    loop, info = verify(keyframes[row], candidate, neighbours, _verification_config(end, is_free=False))
+    loop, info = verify(keyframes[row], candidate, neighbours, _verification_config(end, is_free))
     if info.violation is not None:
         end = replace(end, violating=[*end.violating, info.violation])
     if loop is not None:

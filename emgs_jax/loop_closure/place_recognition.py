@@ -175,9 +175,14 @@ def add_keyframe(database: Database, keyframe: Keyframe, config: PlaceRecognitio
     if len(keyframes) < 2 * database.num_trained:
         vector = vlad(unit_descriptors(keyframe), database.words)
         return Database(keyframes, database.words, np.vstack([database.vectors, vector]), database.num_trained)
+    return train_database(keyframes, config)
+
+
+def train_database(keyframes: Sequence[Keyframe], config: PlaceRecognitionConfig) -> Database:
+    """Make the database of keyframes, in their order, with words of all of them."""
     words = train_vocabulary(np.concatenate([unit_descriptors(one) for one in keyframes]), config)
     vectors = np.stack([vlad(unit_descriptors(one), words) for one in keyframes])
-    return Database(keyframes, words, vectors, len(keyframes) if len(words) else 0)
+    return Database(tuple(keyframes), words, vectors, len(keyframes) if len(words) else 0)
 
 
 def train_vocabulary(

@@ -244,7 +244,7 @@ def camera_in_world(info: StepInfo) -> Sim3:
     return Sim3(float(info.localization.scale), T[:3, :3], T[:3, 3])
 
 
-def join(atlas: Atlas, window: WindowInput, event: Event, found: Found) -> Atlas:
+def join_at(atlas: Atlas, window: WindowInput, event: Event, found: Found) -> Atlas:
     """Join the active submap, with this frame as its last node, and the one where the frame was found.
 
     The newer one moves, by the similarity of the event or its inverse.
@@ -288,13 +288,18 @@ def join_factor(graph: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
     return Factor(a, b, measured, ratio, np.linalg.cholesky(information).T, is_loop=False)
 
 
-def set_unjoined_apart(atlas: Atlas) -> Atlas:
-    """Make the submap of most placed frames, or the saved map's, the active one; the others stay as they are, apart."""
+def set_unjoined_apart(atlas: Atlas, kept: int | None = None) -> Atlas:
+    """Make a submap the active one; the others stay as they are, apart.
+
+    Args:
+        kept: its number; None: that of most placed frames, or the saved map's.
+    """
     if len(atlas.submaps) < 2:
         return atlas
     graph, known = atlas.graph, atlas.graph.database
-    counts = Counter(node.submap for node in graph.nodes if node.is_placed)
-    kept = 0 if graph.first_node else max(sorted(counts), key=lambda one: counts[one])
+    if kept is None:
+        counts = Counter(node.submap for node in graph.nodes if node.is_placed)
+        kept = 0 if graph.first_node else max(sorted(counts), key=lambda one: counts[one])
     is_kept = [node.submap == kept for node in graph.nodes]
     between = {
         name: [one for one in getattr(graph, name) if is_kept[one.a] and is_kept[one.b]]

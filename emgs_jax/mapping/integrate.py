@@ -29,7 +29,7 @@ from emgs_jax.mapping.atlas import (
     Found,
     begin,
     camera_in_world,
-    join,
+    join_at,
     locate,
     return_to_world,
     with_state,
@@ -241,7 +241,7 @@ def update_graph(
     if atlas.graph.config is None:
         return atlas
     if found is not None:
-        atlas = join(atlas, window, event, found)
+        atlas = join_at(atlas, window, event, found)
     graph, loops = verify_loops(atlas.graph, window, query)
     atlas = replace(atlas, graph=graph)
     return atlas if loops is None else optimize_and_deform(atlas, loops)

@@ -65,7 +65,7 @@ class Scorer:
     evaluation: EvaluationConfig
     truth: Reference
     labels: LabelledPoints | None
-    prior: Prior
+    prior: Prior | None
 
 
 def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior) -> Scorer:
@@ -211,21 +211,22 @@ def score_settings(
     return [metrics | shared.result() for metrics in found]
 
 
-def describe(run: MappingRun, dataset: ReadableFrames) -> Metrics:
-    """Size of the map, how many frames came to what, time and memory."""
+def describe(run: MappingRun, dataset: ReadableFrames | None = None) -> Metrics:
+    """Size of the map, how many frames came to what, time and memory; without a data set none was left out."""
     statuses = Counter(record.status for record in run.records)
     metrics: Metrics = {"map/num_gaussians": int(np.asarray(confirmed(run.state.map).valid).sum())}
     metrics["map/double_wall_percent"] = double_walls(confirmed(run.state.map), metre(run))
     metrics["map/num_tentative"] = int(np.asarray(run.state.map.gaussians.valid).sum()) - metrics["map/num_gaussians"]
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
-    metrics["frames/skipped"] = len(dataset.skipped)
+    metrics["frames/skipped"] = 0 if dataset is None else len(dataset.skipped)
     for number in run.apart:
         metrics |= _submap_metrics(run, number)
     metrics["segments/unjoined_frames"] = sum(record.reason == UNJOINED for record in run.records)
     row = longest_row(run.records)
     metrics["frames/longest_untracked"] = len(row)
-    metrics["frames/longest_untracked_from"] = dataset.kept[run.records[row[0]].index] if row else None
+    start = run.records[row[0]].index if row else None
+    metrics["frames/longest_untracked_from"] = start if start is None or dataset is None else dataset.kept[start]
     metrics["frames/overflow"] = sum(record.overflow or 0 for record in run.records)
     metrics["time/seconds_per_frame"] = seconds_per_frame(run.records)
     return metrics

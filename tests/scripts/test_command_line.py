@@ -30,6 +30,7 @@ from experiments.command import check_arguments, check_missing, check_out, kept_
 from experiments.console import speak_on
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
+from experiments.merge import positionals
 from experiments.report import positional
 
 
@@ -115,7 +116,7 @@ def test_the_help_of_a_command_names_its_keys_and_its_examples_are_ones(name, mo
     assert not any(str(path) in said for path in (CONF.parent, Path.home(), Path(sys.prefix)))
     examples = [shlex.split(line) for line in said.splitlines() if line.startswith(f"  emgs {name} ")]
     assert len(examples) >= 2
-    rewritten = delegated if name == "evaluate" else positional
+    rewritten = {"evaluate": delegated, "merge": positionals}.get(name, positional)
     for _, _, *words in examples:
         check_arguments(name, rewritten(words))
 

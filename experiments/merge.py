@@ -1,0 +1,46 @@
+"""Several finished runs as one: `python -m experiments.merge FOLDER FOLDER out=FOLDER`."""
+
+from pathlib import Path
+from typing import Any
+
+from omegaconf import DictConfig
+
+from emgs_jax.config.overrides import KEY, quoted
+from emgs_jax.report.merging import merge
+from emgs_jax.report.printout import last_words, metrics_table
+from emgs_jax.report.recorded_run import REPORT_FILE
+
+from .command import command
+
+
+def merge_runs(config: DictConfig) -> tuple[dict[str, Any], list[str]]:
+    """Check what `config` names, and merge it; returns metrics, and what there is to say."""
+    folders, out = [Path(str(folder)) for folder in config.folders], Path(str(config.out))
+    if len(folders) < 2:
+        raise ValueError(f"there is one run to merge, {folders[0]}: give two or more: emgs merge RUN RUN out=FOLDER")
+    if len({folder.resolve() for folder in folders}) < len(folders):
+        raise ValueError(f"a run is named twice in {', '.join(map(str, folders))}: give each once")
+    if out.exists():
+        raise ValueError(f"out={out} is there already: give a folder that is not")
+    return merge(folders, out, config.truth)
+
+
+def positionals(arguments: list[str]) -> list[str]:
+    """The first words that are no overrides are the folders."""
+    count = next((n for n, word in enumerate(arguments) if word.startswith("-") or KEY.match(word)), len(arguments))
+    folders = ",".join(map(quoted, arguments[:count]))
+    return [f"folders=[{folders}]", *arguments[count:]] if count else arguments
+
+
+@command("merge", positionals)
+def main(config: DictConfig) -> None:
+    """Merge, and say where it is."""
+    metrics, notes = merge_runs(config)
+    print("\n".join(notes) if notes else "all runs are joined")
+    if "trajectory/num_frames" in metrics:
+        print(metrics_table(metrics))
+    print(f"{last_words(metrics)}everything is in {config.out}, {REPORT_FILE} shows it")
+
+
+if __name__ == "__main__":
+    main()
