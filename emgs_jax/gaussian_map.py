@@ -134,7 +134,7 @@ def transform_rows(
 
 
 @full_precision
-def transformed(map: GaussianMap, scale: float, rotation: ArrayLike, translation: ArrayLike) -> GaussianMap:
+def transformed(map: GaussianMap, scale: ArrayLike, rotation: ArrayLike, translation: ArrayLike) -> GaussianMap:
     """Apply one similarity y = s R x + t to a whole map; free rows stay neutral."""
     s, R, t = (jnp.asarray(value, jnp.float32) for value in (scale, rotation, translation))
     means = s * jnp.einsum("ij,nj->ni", R, map.gaussians.means) + t

@@ -37,12 +37,13 @@ FORMAT = 3  # of entries; 2 were found by the text of source files
 # By what XLA decides how many threads an executable has, beside the CPUs that the process may use.
 THREADS = ("XLA_FLAGS", "PJRT_NPROC", "NPROC")
 COMPILED = "/jax/core/compile/backend_compile_duration"
+LOOKED, FOUND = (f"/jax/compilation_cache/{name}" for name in ("compile_requests_use_cache", "cache_hits"))
 # Defaults, but executables that are asked for with one of them are others to JAX's cache: what was taken from there
 # cannot be kept again, as on CPUs it has lost its functions (jaxlib 0.10.1). The second is for a file that was damaged.
 _OPTIONS = {"xla_embed_ir_in_executable": False}, {"xla_dump_hlo_as_text": False}, {"xla_dump_hlo_as_proto": False}
 _loaded: dict[tuple, Callable] = {}
 _seen: dict[tuple, tuple] = {}  # what this process has traced: a function and classes, and their fingerprint
-_thread = threading.local()  # `hits`: executables that JAX took from its cache
+_thread = threading.local()  # `heard`: what JAX says of its cache
 _making: dict[int, str] = {}  # thread -> the function that it compiles
 _counted = [0, 0]  # of the stages that are made side by side: those that are done, and all
 
@@ -207,14 +208,19 @@ def _used(lowered: Any, digest: str) -> list[object]:
 
 
 def _compiled(lowered: Any) -> tuple[Callable, bool]:
-    """An executable, and whether it was made here and is not from JAX's cache."""
+    """An executable, and whether it was made here: JAX looked into its cache, where it was not.
+
+    What JAX still has in memory may be from its cache, too, and of that it says nothing.
+    """
     _listen()
+    is_new = False
     for options in _OPTIONS:
-        _thread.hits = 0
+        _thread.heard = set()
         found = lowered.compile(options)
-        if not _thread.hits:
+        is_new = LOOKED in _thread.heard and FOUND not in _thread.heard
+        if is_new:
             break
-    return found, not _thread.hits
+    return found, is_new
 
 
 def _runnable(program: str, function: Callable, arguments: tuple, outputs: Any) -> Callable | None:
@@ -236,9 +242,23 @@ def _runnable(program: str, function: Callable, arguments: tuple, outputs: Any) 
         return None
     name = function.__wrapped__.__name__
     jax.monitoring.record_event_duration_secs(COMPILED, time.perf_counter() - begin, fun_name=name)
+    is_sound: bool | None = None  # what its first call tells: one that has lost its functions loads as any other
 
     def run(*arguments: Any) -> Any:
-        _, *found = executable(*_arrays(arguments))
+        nonlocal is_sound
+        if is_sound is False:
+            return function(*arguments)
+        try:
+            _, *found = executable(*_arrays(arguments))
+            if not is_sound:
+                jax.block_until_ready(found)
+                is_sound = True
+        except jax.errors.JaxRuntimeError as error:
+            if is_sound:
+                raise
+            is_sound = False
+            remove(_folder(), program, error)
+            return function(*arguments)
         arrays = iter(found)
         filled = [next(arrays) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf for leaf in leaves]
         return jax.tree.unflatten(structure, filled)
@@ -258,10 +278,10 @@ def _prepare_lapack() -> None:
 
 @cache
 def _listen() -> None:
-    """Count in each thread what JAX takes from its cache."""
+    """Hear in each thread what JAX says of its cache."""
 
     def hear(event: str, **_: Any) -> None:
-        _thread.hits = getattr(_thread, "hits", 0) + (event == "/jax/compilation_cache/cache_hits")
+        _thread.heard = {event, *getattr(_thread, "heard", ())}
 
     jax.monitoring.register_event_listener(hear)
 

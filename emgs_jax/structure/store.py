@@ -26,6 +26,7 @@ ABOUT = "structure.json"
 NOT_OF_MODELS = ("model", "median_depth", "pixel_std", "max_gap")  # settings of what is made of the models
 PARTS = ("cameras", "images")
 CACHE = Path("~/.cache/emgs_jax/structure")
+SQLITE = b"SQLite format 3\0"  # how its files begin
 
 
 def key_of(shots: Shots, config: StructureConfig) -> str:
@@ -186,6 +187,8 @@ def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any
     else:
         with tempfile.TemporaryDirectory() as work:
             shutil.copy(database, Path(work) / DATABASE)
+            if not database.read_bytes().startswith(SQLITE):  # COLMAP may take it for an empty one
+                raise ValueError(f"{key} is no database of COLMAP, or a damaged one (it is no file of SQLite)")
             try:
                 models = map_database(shots, config, Path(work))
             except RuntimeError as error:

@@ -218,6 +218,39 @@ def test_a_class_of_others_is_not_made_and_what_xla_refuses_is_compiled(folder, 
     assert str(program) in capsys.readouterr().err
 
 
+def test_what_jax_took_from_its_cache_is_not_kept_when_it_is_asked_again(folder):
+    """It has lost its functions; JAX has it in memory then, and does not say where it is from."""
+    for _ in executables._OPTIONS:  # now JAX's cache has it with each of them
+        as_a_new_process()
+        expected = call(function, *arguments())
+        for path in entries(folder):
+            path.unlink()
+    as_a_new_process()
+    for _ in range(2):
+        assert_same(call(function, *arguments()), expected)
+        executables.forget()
+    assert not [path for path in entries(folder) if path.stat().st_size > 1000]
+
+
+def test_an_executable_that_fails_when_it_is_first_called_is_compiled_anew(folder, monkeypatch, capsys):
+    expected = call(function, *arguments())
+    as_a_new_process()
+
+    def without_functions(*_, **__):
+        def failing(*_):
+            raise jax.errors.JaxRuntimeError("NOT_FOUND: Function broadcast_in_dim.1_kernel not found")
+
+        return failing
+
+    with monkeypatch.context() as patch:
+        patch.setattr(executables.serialize_executable, "deserialize_and_load", without_functions)
+        for _ in range(2):
+            assert_same(call(function, *arguments()), expected)
+    assert capsys.readouterr().err.count("kernel not found") == 1
+    as_a_new_process()
+    assert_same(call(function, *arguments()), expected)
+
+
 def test_inside_jit_and_vmap_and_without_a_folder_functions_are_called_as_they_are(folder):
     points, camera, names = arguments()
     one = lambda points: call(function, points, camera, names)[2]  # noqa: E731
