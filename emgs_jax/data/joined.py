@@ -1,7 +1,7 @@
 """Frames of several data sets as one, in one camera that shows what all of theirs show."""
 
 import hashlib
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -21,7 +21,7 @@ class JoinedFrames(Dataset):
     """
 
     def __init__(self, parts: Sequence[Dataset], has_truth: bool = True) -> None:
-        self.name, self.sequence = ("+".join(dict.fromkeys(map(str, names))) for names in _names(parts))
+        self.name, self.sequence = (joined_name(getattr(one, key) for one in parts) for key in ("name", "sequence"))
         self.size, self.intrinsics = common_camera([(one.size, one.intrinsics) for one in parts])
         self.classes = parts[0].classes if len({tuple(one.classes) for one in parts}) == 1 else ()
         self.has_ground_truth = has_truth and all(one.has_ground_truth for one in parts)
@@ -53,8 +53,9 @@ class JoinedFrames(Dataset):
         return hashlib.sha256(repr(known).encode()).hexdigest()
 
 
-def _names(parts: Sequence[Dataset]) -> tuple[list[str], list[str]]:
-    return [one.name for one in parts], [one.sequence for one in parts]
+def joined_name(names: Iterable[object]) -> str:
+    """The names, each once."""
+    return "+".join(dict.fromkeys(map(str, names)))
 
 
 def common_camera(cameras: Sequence[tuple[Size, Intrinsics]]) -> tuple[Size, Intrinsics]:

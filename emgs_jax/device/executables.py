@@ -225,7 +225,8 @@ def _compiled(lowered: Any) -> tuple[Callable, bool]:
 
 def _runnable(program: str, function: Callable, arguments: tuple, outputs: Any) -> Callable | None:
     """The kept executable of a program, as that function of such arguments; told as JAX tells what its cache gives."""
-    begin, payload = time.perf_counter(), read(_folder(), program)
+    folder, begin = _folder(), time.perf_counter()
+    payload = read(folder, program)
     if payload is None:
         return None
     leaves, structure = jax.tree.flatten(outputs)
@@ -238,7 +239,7 @@ def _runnable(program: str, function: Callable, arguments: tuple, outputs: Any) 
             payload, inputs, marked, execution_devices=jax.devices()[:1]
         )
     except Exception as error:  # whatever XLA dislikes
-        remove(_folder(), program, error)
+        remove(folder, program, error)
         return None
     name = function.__wrapped__.__name__
     jax.monitoring.record_event_duration_secs(COMPILED, time.perf_counter() - begin, fun_name=name)
@@ -257,7 +258,7 @@ def _runnable(program: str, function: Callable, arguments: tuple, outputs: Any) 
             if is_sound:
                 raise
             is_sound = False
-            remove(_folder(), program, error)
+            remove(folder, program, error)
             return function(*arguments)
         arrays = iter(found)
         filled = [next(arrays) if isinstance(leaf, jax.ShapeDtypeStruct) else leaf for leaf in leaves]

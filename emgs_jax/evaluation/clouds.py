@@ -17,7 +17,7 @@ from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
-_PART_ROWS = 500_000  # points that are averaged together: bounds the memory, does not change the result
+PART_ROWS = 500_000  # points that are worked on together: bounds the memory, does not change the result
 SOME = 61  # every so manieth point says where a cloud is divided
 
 
@@ -82,8 +82,8 @@ def _fitted_normals(points: np.ndarray, num_neighbours: int) -> np.ndarray:
     """
     distinct, rows = np.unique(points, axis=0, return_inverse=True)
     search, normals = NearestPoints(distinct), np.zeros_like(distinct)
-    for begin in range(0, len(distinct), _PART_ROWS // num_neighbours):
-        part = slice(begin, begin + _PART_ROWS // num_neighbours)
+    for begin in range(0, len(distinct), PART_ROWS // num_neighbours):
+        part = slice(begin, begin + PART_ROWS // num_neighbours)
         near = distinct[search.query(distinct[part], num_neighbours)[1]]
         offsets = near - near.mean(1, keepdims=True)
         spread, axes = np.linalg.eigh(np.einsum("nki,nkj->nij", offsets, offsets))
@@ -256,36 +256,46 @@ def _cloud(rows: np.ndarray) -> PointCloud:
 
 
 def cell_edges(some: np.ndarray, count: int, voxel: float) -> np.ndarray:
-    """Numbers of the cells that part `count` points into ranges of about `_PART_ROWS`, as `some` (n, 3) are spread."""
-    numbers, num_parts = np.sort(cell_numbers(some, voxel)), -(-count // _PART_ROWS)
+    """Numbers of the cells that part `count` points into ranges of about `PART_ROWS`, as `some` (n, 3) are spread."""
+    numbers, num_parts = np.sort(cell_numbers(some, voxel)), -(-count // PART_ROWS)
     return numbers[len(numbers) * np.arange(1, num_parts) // max(num_parts, 1)]
 
 
-def _average(parts: Iterator[np.ndarray], edges: np.ndarray, voxel: float) -> VoxelMeans:
-    """Average rows (n, 9) per voxel; those of the cells between two `edges` are in memory at a time."""
+def by_ranges(parts: Iterable[tuple[np.ndarray, np.ndarray]], edges: np.ndarray) -> Iterator[np.ndarray]:
+    """Rows of the cells between two `edges`, one range after the other: those of one are in memory at a time.
+
+    Args:
+        parts: numbers of the cells of some rows, and the rows; in this order they are given back.
+    """
     spread, places = Spool(), [[] for _ in range(len(edges) + 1)]
-    for rows in _batches(parts):
-        which = np.searchsorted(edges, cell_numbers(rows[:, :3], voxel), side="right")
+    for cells, rows in parts:
+        which = np.searchsorted(edges, cells, side="right")
         order = np.argsort(which, kind="stable")
         ends = np.cumsum(np.bincount(which, minlength=len(places)))
         for place, own in zip(places, np.split(order, ends[:-1]), strict=True):
             if len(own):
                 place.append(spread.append(rows[own]))
-    found, sizes = Spool(), []
     for place in filter(None, places):
-        means = _means(np.concatenate([spread[position] for position in place]), voxel)
+        yield np.concatenate([spread[position] for position in place])
+
+
+def _average(parts: Iterator[np.ndarray], edges: np.ndarray, voxel: float) -> VoxelMeans:
+    """Average rows (n, 9) per voxel."""
+    found, sizes = Spool(), []
+    for rows in by_ranges(((cell_numbers(rows[:, :3], voxel), rows) for rows in _batches(parts)), edges):
+        means = _means(rows, voxel)
         found.append(means)
         sizes.append(len(means))
     return VoxelMeans(found, tuple(sizes))
 
 
 def _batches(parts: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
-    """Rows of one part after the other, about `_PART_ROWS` together."""
+    """Rows of one part after the other, about `PART_ROWS` together."""
     pending: list[np.ndarray] = []
     for part in parts:
-        for begin in range(0, len(part), _PART_ROWS):
-            pending.append(part[begin : begin + _PART_ROWS])
-            if sum(map(len, pending)) >= _PART_ROWS:
+        for begin in range(0, len(part), PART_ROWS):
+            pending.append(part[begin : begin + PART_ROWS])
+            if sum(map(len, pending)) >= PART_ROWS:
                 yield np.concatenate(pending)
                 pending = []
     if pending:

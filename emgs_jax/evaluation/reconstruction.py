@@ -9,6 +9,7 @@ import numpy as np
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import (
+    PART_ROWS,
     NearestPoints,
     PointCloud,
     SpooledCloud,
@@ -25,7 +26,6 @@ from emgs_jax.geometry import Sim3
 from emgs_jax.ops.ranges import number
 
 Metrics = dict[str, float | int | str | None]
-_PART_ROWS = 500_000  # points that are aligned together: bounds the memory, does not change the result
 _BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is computed in between stays in the cache
 
 
@@ -188,7 +188,7 @@ def align_points(
     alignment, _ = align_poses(*poses, with_scale=config.alignment == "sim3")
     if config.icp_distance_m == 0:
         return alignment.apply(points)
-    parts = (alignment.apply(points[row : row + _PART_ROWS]) for row in range(0, len(points), _PART_ROWS))
+    parts = (alignment.apply(points[row : row + PART_ROWS]) for row in range(0, len(points), PART_ROWS))
     source = coarse_points(parts, config.icp_voxel_m)
     return (_moved(source, truth, config.icp_distance_m, config) @ alignment).apply(points)
 

@@ -14,7 +14,7 @@ from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.class_file import ClassFile
 from emgs_jax.data.spool import Spool
-from emgs_jax.evaluation.clouds import SOME, NearestPoints, cell_centers, cell_edges, cell_numbers
+from emgs_jax.evaluation.clouds import SOME, NearestPoints, by_ranges, cell_centers, cell_edges, cell_numbers
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_points, own_voxel
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.geometry import rotated
@@ -135,15 +135,13 @@ class SpooledLabels:
 
         A view counts once in a voxel; of equally frequent classes it is the first.
         """
-        edges, spread = cell_edges(np.concatenate(self._some), self._count, voxel), Spool()
-        places: list[list[int]] = [[] for _ in range(len(edges) + 1)]
-        for row in range(len(self._parts)):
-            view = self._parts[row]
-            pairs = _distinct(np.column_stack([view[:, 3].astype(np.int64), cell_numbers(view[:, :3], voxel)]))
-            for place, own in zip(places, np.split(pairs, np.searchsorted(pairs[:, 1], edges)), strict=True):
-                if len(own):
-                    place.append(spread.append(own))
-        found = [_most_seen(np.concatenate([spread[row] for row in place])) for place in filter(None, places)]
+        edges = cell_edges(np.concatenate(self._some), self._count, voxel)
+        views = (self._parts[row] for row in range(len(self._parts)))
+        seen = (
+            _distinct(np.column_stack([view[:, 3].astype(np.int64), cell_numbers(view[:, :3], voxel)]))
+            for view in views
+        )
+        found = [_most_seen(rows) for rows in by_ranges(((pairs[:, 1], pairs) for pairs in seen), edges)]
         whole = np.concatenate([np.empty((0, 2), np.int64), *found])
         return LabelledPoints(cell_centers(whole[:, 1], voxel), whole[:, 0].astype(np.int32), self._classes)
 

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 from emgs_jax.back_end.saved_map import PLACES_FILE, SavedMap, load_places
 from emgs_jax.back_end.state import BackEnd, Node
 from emgs_jax.config.configure import CONF, build, build_dataset, compose, graph_config, message_of
-from emgs_jax.data.joined import common_camera
+from emgs_jax.data.joined import common_camera, joined_name
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.features.text import save_text
 from emgs_jax.io.files import FrameLog, new_folder
@@ -195,7 +195,7 @@ def _origin(parts: Sequence[RecordedRun], has_truth: bool) -> tuple[dict[str, An
         dataset, note = build_dataset(OmegaConf.create(settings)), ""
     except (ValueError, OSError) as error:
         dataset, note = None, f"colours are those of the Gaussians, for images are gone: {message_of(error)}"
-    data = {key: "+".join(dict.fromkeys(str(one.provenance["data"][key]) for one in parts)) for key in OF_DATA}
+    data = {key: joined_name(one.provenance["data"][key] for one in parts) for key in OF_DATA}
     size, intrinsics = common_camera([_camera_of(one) for one in parts])
     data |= {"fingerprint": dataset and dataset.fingerprint(), "camera": {}}
     origin = {"config": settings, "git": git_now(), "simulated": any(one.provenance["simulated"] for one in parts)}

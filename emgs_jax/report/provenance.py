@@ -120,7 +120,7 @@ def has_metric_truth(block: Mapping[str, Any]) -> bool:
 def in_unit(columns: Iterable[Column], names: Collection[str]) -> list[Column]:
     """Titles of lengths as they are for data sets of these names: in centimetres, or in the truth's own unit."""
     own = [name in _OWN_UNITS for name in names]
-    unit = "cm or .01 units" * (not all(own)) or ".01 units"
+    unit = ".01 units" if all(own) else "cm or .01 units"
     return [c._replace(title=c.title.replace("[cm]", f"[{unit}]")) if any(own) else c for c in columns]
 
 

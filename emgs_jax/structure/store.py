@@ -185,10 +185,11 @@ def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any
     if is_model or not database.is_file():
         models = read_models(place)
     else:
+        with database.open("rb") as handle:
+            if handle.read(len(SQLITE)) != SQLITE:  # COLMAP may take it for an empty one
+                raise ValueError(f"{key} is no database of COLMAP, or a damaged one (it is no file of SQLite)")
         with tempfile.TemporaryDirectory() as work:
             shutil.copy(database, Path(work) / DATABASE)
-            if not database.read_bytes().startswith(SQLITE):  # COLMAP may take it for an empty one
-                raise ValueError(f"{key} is no database of COLMAP, or a damaged one (it is no file of SQLite)")
             try:
                 models = map_database(shots, config, Path(work))
             except RuntimeError as error:

@@ -78,7 +78,7 @@ def test_fusing_pieces_is_reducing_the_whole_part_by_part(monkeypatch):
     pieces = [PointCloud(cloud.points[i::7], cloud.normals[i::7], cloud.colors[i::7]) for i in range(7)]
     poisoned = PointCloud(np.full((5, 3), np.nan), np.zeros((5, 3)), np.zeros((5, 3)))
     whole = voxel_downsample(cloud, 0.1)
-    monkeypatch.setattr("emgs_jax.evaluation.clouds._PART_ROWS", 50)
+    monkeypatch.setattr("emgs_jax.evaluation.clouds.PART_ROWS", 50)
     monkeypatch.setattr("emgs_jax.evaluation.clouds.SOME", 3)
     spooled = SpooledCloud()
     for piece in (*pieces, poisoned):

@@ -237,7 +237,7 @@ def test_a_sample_of_the_estimate_changes_its_accuracy_by_chance_and_its_complet
     away = Sim3(0.5, Rotation.random(rng=rng).as_matrix(), np.array([1.0, -2.0, 3.0]))
     given = transform_cloud(estimate, away), reference(truth, CONFIG), (away.apply_to_poses(poses), poses)
     whole = compare_placements(*given, CONFIG, [0.0, 0.1])
-    monkeypatch.setattr("emgs_jax.evaluation.clouds._PART_ROWS", 500)
+    monkeypatch.setattr("emgs_jax.evaluation.clouds.PART_ROWS", 500)
     sampled = compare_placements(*given, dataclasses.replace(CONFIG, num_sampled=1000), [0.0, 0.1])
     assert whole[0] != whole[1], "the second is moved by ICP"
     for found, expected in zip(sampled, whole, strict=True):
@@ -249,7 +249,7 @@ def test_a_sample_of_the_estimate_changes_its_accuracy_by_chance_and_its_complet
 
 def test_a_cloud_twice_as_long_takes_a_fraction_of_its_points_more(monkeypatch):
     """A point is 36 bytes on the disk; two placements of all points and their searches took 580 in memory."""
-    monkeypatch.setattr("emgs_jax.evaluation.clouds._PART_ROWS", 5000)
+    monkeypatch.setattr("emgs_jax.evaluation.clouds.PART_ROWS", 5000)
     config, rng = dataclasses.replace(CONFIG, num_sampled=1000), np.random.default_rng(0)
 
     def wall(x):

@@ -145,7 +145,7 @@ def test_the_class_of_a_voxel_is_that_of_most_views_and_a_view_counts_once(monke
         seen.append(np.array([here, there]), np.array(labels))
     seen.append(np.array([here, [np.nan, 0, 0]]), np.array([0, 0]))
     for most in (500_000, 2):  # all cells together, or each by itself
-        monkeypatch.setattr("emgs_jax.evaluation.clouds._PART_ROWS", most)
+        monkeypatch.setattr("emgs_jax.evaluation.clouds.PART_ROWS", most)
         found = seen.points(0.1)
         np.testing.assert_allclose(found.points, [there, here])  # by cell
         np.testing.assert_array_equal(found.labels, [0, 1])
@@ -160,7 +160,7 @@ def test_classes_of_many_views_are_counted_a_range_of_cells_at_a_time(monkeypatc
         seen.append(rng.uniform(-5.0, 5.0, (500, 3)), rng.integers(0, 4, 500))
     monkeypatch.setattr(segmentation, "_most_seen", lambda rows: sizes.append(len(rows)) or whole(rows))
     for most in (500, 500_000):
-        monkeypatch.setattr("emgs_jax.evaluation.clouds._PART_ROWS", most)
+        monkeypatch.setattr("emgs_jax.evaluation.clouds.PART_ROWS", most)
         found.append(seen.points(0.5))
     assert len(sizes) == 21 and max(sizes[:-1]) < 1500 and sum(sizes[:-1]) == sizes[-1]
     np.testing.assert_array_equal(found[0].points, found[1].points)
