@@ -18,12 +18,7 @@ def closing_covariances(means: np.ndarray, covs: np.ndarray, normals: np.ndarray
     """Covariances (n, 3, 3) that close the surface in an ordinary 3DGS rasteriser; for display only, float64.
 
     Each is widened along its surface until its sixth neighbour lies at `REACH` standard deviations, measured with its
-    own covariance, so that it keeps its shape; none is narrowed, and the thickness along the normal stays.
-
-    Args:
-        means: (n, 3).
-        covs: (n, 3, 3).
-        normals: (n, 3), unit.
+    own covariance, so that it keeps its shape; none is narrowed, and the thickness along the unit normal stays.
     """
     means, covs, normals = (np.asarray(values, np.float64) for values in (means, covs, normals))
     if len(means) < 2:

@@ -25,12 +25,10 @@ _UPPER = np.triu_indices(3)
 
 
 class Layer(NamedTuple):
-    """A layer that a viewer can show.
+    """A layer that a viewer can show: an array of `map_layers` or `feature_layer`.
 
-    Args:
-        array: of `map_layers` or `feature_layer`, which it shows.
-        scale: of numbers that get their colour from their place between the 1st and the 99th percentile: `share` of
-            255, `count` (its logarithm) or `number`; "" where the array has colours of its own.
+    With a `scale` its numbers get their colour from their place between the 1st and the 99th percentile: `share` of
+    255, `count` (its logarithm) or `number`.
     """
 
     title: str
@@ -143,13 +141,8 @@ def fitted(
 ) -> tuple[list[dict[str, Any]], str, int]:
     """Pack at most `limit` characters, with fewer Gaussians where all of them are too many; the last item is how many.
 
-    The paths of some 15,000 frames are too many by themselves: then there is no Gaussian.
-
-    Args:
-        layers: attributes of the Gaussians, by name.
-        paths: other arrays, which stay whole.
-        weight: of the Gaussians: those of most are kept.
-        limit: characters.
+    Those of most weight are kept; `paths` stay whole. The paths of some 15,000 frames are too many by themselves: then
+    there is no Gaussian.
     """
     count = len(weight)
     about, text = packed({**layers, **paths})

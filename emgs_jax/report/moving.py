@@ -14,11 +14,7 @@ _TINT, _OPACITY = np.array([0, 230, 0]), 0.6
 
 
 def moving_mask(line: Mapping[str, Any], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """What moves in the frame of a line of frames.jsonl, in an image of (width, height) `size`.
-
-    Raises:
-        ValueError: the line holds no mask.
-    """
+    """What moves in the frame of a line of frames.jsonl, in an image of (width, height); ValueError without a mask."""
     if not line.get("moving_pixels"):
         return np.zeros(size[::-1], bool)
     try:

@@ -50,12 +50,7 @@ def _drawn(gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: Rende
 
 
 def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, dataset: Dataset | None) -> Views:
-    """Draw the map of a run by our own renderer from some frames, beside their images.
-
-    Args:
-        run: from a frame that is not placed, nothing is drawn.
-        dataset: for the images; None: without them.
-    """
+    """Draw the map of a run by our own renderer from frames that are placed, beside the images of a data set."""
     small, placed = downscale(run.camera, -(-run.camera.width // WIDTH)), run.is_placed
     gaussians = closed(confirmed(run.map))
     known = [row for row in rows if placed[row]]

@@ -7,17 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cloud_scene import INTRINSICS, SHAPE, plane_depth, random_cloud
-from scene import evaluation_config
+from scene import compose, evaluation_config
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.config.configure import build
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, spooled, transform_cloud
 from emgs_jax.evaluation.reconstruction import (
+    camera_cloud,
     compare_clouds,
     compare_placements,
     ground_truth_cloud,
-    posed_cloud,
+    posed,
     reconstruction_metrics,
     reference,
 )
@@ -38,15 +40,10 @@ def a_frame(depth, pose=None, index=0):
     return Frame(index, float(index), "f", image, depth.astype(np.float32), np.eye(4) if pose is None else pose)
 
 
-def test_wrong_config_values_are_named():
-    for name, value, message in (
-        ("alignment", "sim2", "alignment must be sim3 or se3, got 'sim2'"),
-        ("statistic", "median", "statistic must be mean or rmse, got 'median'"),
-        ("voxel_m", 0.0, "voxel_m must be positive, got 0.0"),
-        ("max_distance_m", float("nan"), "max_distance_m must be positive, got nan"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            dataclasses.replace(CONFIG, **{name: value})
+@pytest.mark.parametrize("value", ["alignment=sim2", "statistic=median", "voxel_m=0.0", "max_distance_m=nan"])
+def test_wrong_config_values_are_named(value):
+    with pytest.raises(ValueError, match=f"evaluation.{value.partition('=')[0]} must be .*got"):
+        build(compose(f"evaluation.{value}"), "evaluation")
 
 
 @pytest.mark.parametrize("protocol", ["paper", "mast3r", "nice_slam"])
@@ -157,8 +154,8 @@ def test_the_prior_of_true_points_is_the_ground_truth_and_moves_with_the_poses()
     no_truth = Frame(1, 1.0, "g", frame.image)
     nowhere = Frame(2, 2.0, "h", frame.image, frame.depth)  # where it was taken nobody knows
     truth = ground_truth_cloud([frame, no_truth, nowhere], INTRINSICS, CONFIG)
-    view = (backproject(frame.depth, INTRINSICS), frame.depth > 0, frame.image, frame.T_world_camera)
-    raw = fuse_clouds([posed_cloud(*view, CONFIG)], CONFIG.voxel_m)
+    seen = camera_cloud(backproject(frame.depth, INTRINSICS), frame.depth > 0, frame.image, CONFIG)
+    raw = fuse_clouds([posed(seen, frame.T_world_camera)], CONFIG.voxel_m)
     np.testing.assert_array_equal(raw.points, truth.points)
     np.testing.assert_allclose(truth.colors, 0.2)
     # In the camera's frame the points lie on the plane again.
