@@ -25,7 +25,7 @@ from emgs_jax.io.packages import extra
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.ops.camera import Camera
-from emgs_jax.polish.fit import PolishConfig, Views, fit, is_held_out, locate, with_room, without_transparent
+from emgs_jax.polish.fit import PolishConfig, Views, fit, is_held_out, place_on_splats, with_room, without_transparent
 from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, gaussians_of, relative_gain, ssim
 from emgs_jax.render.composite import Rendering
@@ -97,7 +97,7 @@ def polish(
         for row in held:
             targets.append(target_of(*seen(row)))
         views = Views(targets, run.poses[held], _spreads(run, held, config), all_gains[held])
-        poses[held] = locate(anchors, fitted, views, run.camera, config)
+        poses[held] = place_on_splats(anchors, fitted, views, run.camera, config)
         save_trajectory_tum(run.folder / PATH_FILE, [line["timestamp"] for line in run.frames], poses)
     splats, opacity = gaussians_of(anchors, fitted)
     count = _save_splats(run, splats, opacity, nearest)
