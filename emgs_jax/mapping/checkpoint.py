@@ -34,7 +34,7 @@ from emgs_jax.registration.pose_noise import Repeats
 from emgs_jax.slam import SlamState
 
 CHECKPOINT_FILE = "checkpoint.npz"
-FORMAT, VERSION = "emgs_jax.checkpoint", 8
+FORMAT, VERSION = "emgs_jax.checkpoint", 9
 OF_MAPS = (Submap, World, SlamState, GaussianMap, Gaussians, Observation, Looks, PoseEstimate, Repeats, jaxlie.SE3)
 OF_GRAPH = (BackEnd, Node, Factor, LoopMeasurement, Refusal, Closure, PoseGraphInfo, Database, Keyframe)
 
