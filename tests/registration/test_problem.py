@@ -23,7 +23,7 @@ from emgs_jax.registration.problem import (
 )
 
 information_of_rows, rows_of = on_host(problems.information_of_rows), on_host(problems.rows_of)
-pose_information = on_host(problems.information)
+pose_information = on_host(problems.information_of_surface)
 jacobian_of = on_host(jax.jacfwd(problems.rows_of))
 NOWHERE = np.zeros(7, np.float32)
 DISTRIBUTION, STD, DEPTH_NOISE = 1, 0.01, 0.03
