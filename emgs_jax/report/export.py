@@ -19,8 +19,8 @@ from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.ranges import number
 from emgs_jax.report.colors import OURS, STATUS_COLORS, rgb, save_png
+from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.report.moving import moving_mask
-from emgs_jax.report.recorded_run import RecordedRun
 
 POINTS_FILE = "points.ply"
 FORMATS = {"colmap": "colmap", "nerfstudio": "nerfstudio", "frustums": "cameras.ply"}  # and what is written
@@ -43,7 +43,7 @@ class ExportConfig:
     moving: str = field(default="kept", metadata={"choices": ("kept", "masked")})
 
 
-def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
+def export(run: FinishedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
     """Write a run into `folder`, which is there, in the run's unit; returns what was written.
 
     Args:
@@ -71,7 +71,7 @@ def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: Readab
     return [folder / FORMATS[name] for name in config.formats]
 
 
-def find_factor(run: RecordedRun, config: ExportConfig) -> float | None:
+def find_factor(run: FinishedRun, config: ExportConfig) -> float | None:
     """Return the factor on all lengths of a run, from `scale` or `length`; None if neither is given."""
     if config.length is None:
         return config.scale
@@ -80,7 +80,7 @@ def find_factor(run: RecordedRun, config: ExportConfig) -> float | None:
     return factor_of(run, config.length)
 
 
-def _project(run: RecordedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig, is_colmap: bool) -> None:
+def _project(run: FinishedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig, is_colmap: bool) -> None:
     """Write images/ and masks/ of the placed frames, and sparse/0/ of COLMAP or nerfstudio's transforms.json.
 
     An image is undistorted and in the run's size. Its name is the frame's number and has one dot: 3DGS cuts at the
@@ -108,14 +108,14 @@ def _project(run: RecordedRun, folder: Path, dataset: ReadableFrames, config: Ex
         save_transforms(folder / "transforms.json", run.camera, files, poses, POINTS_FILE, masks)
 
 
-def _frustums(run: RecordedRun, path: Path) -> None:
+def _frustums(run: FinishedRun, path: Path) -> None:
     """Write a pyramid for every frame in the colour of its status; the path is cut where the camera was lost."""
     colors = np.array([rgb(STATUS_COLORS.get(frame["status"], OURS)) for frame in run.frames])
     is_joined = run.is_placed[1:] & run.is_placed[:-1]
     save_frustums(path, run.camera, run.poses, colors, is_joined, rgb(OURS))
 
 
-def _cloud(run: RecordedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
+def _cloud(run: FinishedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
     """Draw at most so many points (p, 3) with colours (p, 3), uint8, of the dense cloud; the same ones every time."""
     columns = read_vertices(run.folder / POINTS_FILE)
     rows = np.sort(np.random.default_rng(0).permutation(len(columns["x"]))[:max_points])
@@ -123,7 +123,7 @@ def _cloud(run: RecordedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
     return points, np.stack([columns[name][rows] for name in ("red", "green", "blue")], 1)
 
 
-def factor_of(run: RecordedRun, length: Sequence[float]) -> float:
+def factor_of(run: FinishedRun, length: Sequence[float]) -> float:
     """Find the factor that makes the distance between two cameras as long as it is known to be.
 
     Args:
@@ -147,7 +147,7 @@ def factor_of(run: RecordedRun, length: Sequence[float]) -> float:
     return length[2] / distance
 
 
-def write_scaled(run: RecordedRun, folder: Path, factor: float) -> RecordedRun:
+def write_scaled(run: FinishedRun, folder: Path, factor: float) -> FinishedRun:
     """Write trajectories, map.npz, clouds and scale.json into `folder`, which is there; returns the run in that unit.
 
     About the origin of the world, which stays. What the run does not have is left out; truth and features stay.

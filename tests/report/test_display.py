@@ -14,7 +14,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.render.composite import render
 from emgs_jax.render.densify import densify
 from emgs_jax.report.display import LARGEST, closing_covariances
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.splats import read_splats
 
 

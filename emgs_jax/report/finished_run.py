@@ -41,7 +41,7 @@ _OUTCOMES = ("accepted", "known", "unconfirmed", "unsolved", "refused")
 
 
 @dataclass(frozen=True)
-class RecordedRun:
+class FinishedRun:
     """Outputs of a finished run, as read from its folder; poses are T_world_camera of `frames`, (n, 4, 4) float64."""
 
     folder: Path
@@ -78,7 +78,7 @@ class RecordedRun:
         return is_metric(self.provenance["prior"]["settings"])
 
 
-def read_run(folder: Path) -> RecordedRun:
+def read_run(folder: Path) -> FinishedRun:
     """Read the folder of a finished run of this version; any other raises ValueError with the file and the remedy."""
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder: give the one that a run wrote, with metrics.json in it")
@@ -94,7 +94,7 @@ def read_run(folder: Path) -> RecordedRun:
         counts = f"frames.jsonl has {len(frames)} poses and trajectory.txt {len(poses)}"
         raise ValueError(f"{folder}: {counts}: they are of two runs, or one was cut off; run again")
     raw, truth = (_poses(folder / FRAMES_FILE, frames, name) for name in ("raw_pose", "true_pose"))
-    return RecordedRun(
+    return FinishedRun(
         folder=folder,
         metrics=metrics,
         frames=frames,
@@ -183,7 +183,7 @@ def _loops(path: Path, count: int) -> list[dict[str, Any]]:
     return loops
 
 
-def render_config(run: RecordedRun) -> RenderConfig:
+def render_config(run: FinishedRun) -> RenderConfig:
     """Read how the run drew its map; raises ValueError for settings of another version."""
     settings = dict(run.provenance["config"]["densify"]["render"])
     settings.pop("_target_", None)
@@ -201,7 +201,7 @@ class PlacedPaths(NamedTuple):
     errors: dict[str, np.ndarray]
 
 
-def placed_paths(run: RecordedRun) -> PlacedPaths:
+def placed_paths(run: FinishedRun) -> PlacedPaths:
     """Move the true path and the raw prior's to where they fit our path best; what is left of the difference.
 
     Each path is placed on the true one by itself, as for its error in metrics.json. Without truth the raw prior's path
