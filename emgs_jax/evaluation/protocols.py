@@ -10,7 +10,13 @@ from typing import Any
 import numpy as np
 
 from emgs_jax.evaluation.clouds import NearestPoints
-from emgs_jax.evaluation.segmentation import LabelledPoints, confusion_matrix, segmentation_metrics, transfer_labels
+from emgs_jax.evaluation.segmentation import (
+    LabelledPoints,
+    confusion_matrix,
+    most_seen,
+    segmentation_metrics,
+    transfer_labels,
+)
 from emgs_jax.ops.ranges import number
 
 NAMES = ("miou", "fmiou", "acc")
@@ -113,10 +119,7 @@ def voxel_labels(points: np.ndarray, labels: np.ndarray, voxel: float) -> tuple[
     if voxel <= 0 or not len(points):
         return points, labels
     cells, voxels = np.unique(np.rint(points / voxel).astype(np.int64), axis=0, return_inverse=True)
-    pairs, counts = np.unique(np.column_stack([voxels.ravel(), labels]), axis=0, return_counts=True)
-    order = np.lexsort((pairs[:, 1], -counts, pairs[:, 0]))
-    first = np.unique(pairs[order, 0], return_index=True)[1]
-    return cells * voxel, pairs[order][first, 1]
+    return cells * voxel, most_seen(np.column_stack([labels, voxels.ravel()]))[:, 0]
 
 
 def table_metrics(

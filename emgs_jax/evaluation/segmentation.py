@@ -32,42 +32,34 @@ class LabelledPoints:
     classes: tuple[str, ...]
 
 
-def label_cells(frame: Frame, dataset: Dataset, voxel: float, max_depth: float) -> np.ndarray:
-    """The voxels [m] of the world that a frame sees and the true class in them, each pair once.
+class TrueLabels:
+    """The true classes in the voxels [m] of the world that labelled frames see, each pair once.
 
-    Returns rows (n, 2) of a class and a cell's number, ordered by cell.
+    It grows with what is seen, not with the frames.
     """
-    if frame.labels is None or frame.depth is None or frame.T_world_camera is None:
-        return np.empty((0, 2), np.int64)
-    known = (frame.labels >= 0) & (frame.static_depth > 0) & (frame.depth <= max_depth)
-    points = backproject(frame.depth, dataset.intrinsics)[known]
-    points = rotated(points, frame.T_world_camera[:3, :3]) + frame.T_world_camera[:3, 3]
-    return _distinct(np.column_stack([frame.labels[known].astype(np.int64), cell_numbers(points, voxel)]))
 
+    def __init__(self, dataset: Dataset, voxel: float, max_depth: float) -> None:
+        self._dataset, self._voxel, self._max_depth = dataset, voxel, max_depth
+        self._rows = [np.empty((0, 2), np.int64)]  # a class and a cell's number, by cell; the first is what was merged
 
-class DistinctCells:
-    """The `label_cells` of many frames, each once: it grows with what is seen, not with the frames."""
-
-    def __init__(self) -> None:
-        self._rows = [np.empty((0, 2), np.int64)]  # the first is what was merged
-
-    def append(self, cells: np.ndarray) -> None:
-        """Add those of a frame."""
-        self._rows.append(cells)
+    def append(self, frame: Frame) -> None:
+        """Add what a frame sees."""
+        if frame.labels is None or frame.depth is None or frame.T_world_camera is None:
+            return
+        known = (frame.labels >= 0) & (frame.static_depth > 0) & (frame.depth <= self._max_depth)
+        points = backproject(frame.depth, self._dataset.intrinsics)[known]
+        points = rotated(points, frame.T_world_camera[:3, :3]) + frame.T_world_camera[:3, 3]
+        cells = cell_numbers(points, self._voxel)
+        self._rows.append(_distinct(np.column_stack([frame.labels[known].astype(np.int64), cells])))
         if sum(map(len, self._rows[1:])) > max(_MERGE_ROWS, len(self._rows[0])):
-            self._rows = [self.rows()]
+            self._rows = [_distinct(np.concatenate(self._rows))]
 
-    def rows(self) -> np.ndarray:
-        """All of them (n, 2), ordered by cell."""
-        return _distinct(np.concatenate(self._rows))
-
-
-def true_labels(cells: DistinctCells, dataset: Dataset, voxel: float) -> LabelledPoints | None:
-    """A point for every class that is seen in a voxel [m]: its centre; None where no frame has `label_cells`."""
-    rows = cells.rows()
-    if not len(rows):
-        return None
-    return LabelledPoints(cell_centers(rows[:, 1], voxel), rows[:, 0], tuple(dataset.classes))
+    def points(self) -> LabelledPoints | None:
+        """A point for every class that is seen in a voxel: its centre; None where nothing is seen."""
+        rows = _distinct(np.concatenate(self._rows))
+        if not len(rows):
+            return None
+        return LabelledPoints(cell_centers(rows[:, 1], self._voxel), rows[:, 0], tuple(self._dataset.classes))
 
 
 def align_labels(
@@ -128,12 +120,12 @@ class SpooledLabels:
             pairs = _distinct(np.column_stack([view[:, 3].astype(np.int64), cell_numbers(view[:, :3], voxel)]))
             return pairs[:, 1], pairs
 
-        found = [_most_seen(rows) for rows in self._rows.by_ranges(voxel, read)]
+        found = [most_seen(rows) for rows in self._rows.by_ranges(voxel, read)]
         whole = np.concatenate([np.empty((0, 2), np.int64), *found])
         return LabelledPoints(cell_centers(whole[:, 1], voxel), whole[:, 0].astype(np.int32), self._classes)
 
 
-def _most_seen(rows: np.ndarray) -> np.ndarray:
+def most_seen(rows: np.ndarray) -> np.ndarray:
     """The most frequent label of each cell, of equally frequent ones the first; rows (n, 2) of a label and a cell."""
     rows = rows[np.lexsort(rows.T)]
     begins = np.flatnonzero((np.diff(rows, axis=0, prepend=-1) != 0).any(1))

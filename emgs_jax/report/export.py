@@ -46,12 +46,8 @@ class ExportConfig:
 def export(run: FinishedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
     """Write a run into `folder`, which is there, in the run's unit; returns what was written.
 
-    Args:
-        dataset: the images of the run; None where they are gone.
-
-    Raises:
-        ValueError: an unknown format, one that needs images or points which are not there, or something stands where
-            an export would; then nothing is written.
+    ValueError for an unknown format, one that needs images or points which are not there, or where something stands in
+    the place of an export; then nothing is written.
     """
     if unknown := [name for name in config.formats if name not in FORMATS]:
         raise ValueError(f"formats={unknown[0]} is not known: choose of {', '.join(FORMATS)}")
@@ -126,11 +122,8 @@ def _cloud(run: FinishedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
 def factor_of(run: FinishedRun, length: Sequence[float]) -> float:
     """Find the factor that makes the distance between two cameras as long as it is known to be.
 
-    Args:
-        length: two frames, as `index` of frames.jsonl numbers them, and metres between their camera centres.
-
-    Raises:
-        ValueError: not two frames with a pose that means something and a length above 0, or they are at one place.
+    `length` are two frames, as `index` of frames.jsonl numbers them, and the metres between their camera centres; else,
+    or where a pose means nothing or both are at one place, ValueError.
     """
     if len(length) != 3 or not math.isfinite(length[2]) or length[2] <= 0 or any(n != int(n) for n in length[:2]):
         raise ValueError(f"length must be [frame,frame,metres], two numbers of frames and a length, got {[*length]}")

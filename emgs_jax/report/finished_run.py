@@ -1,8 +1,6 @@
 """A finished run as its folder tells it, for whoever shows it: checked once, read only."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import reduce
 from operator import getitem
@@ -21,7 +19,7 @@ from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report.provenance import is_metric
-from emgs_jax.report.results import METRICS_FILE, read_metrics
+from emgs_jax.report.results import METRICS_FILE, read_metrics, sound
 
 TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `experiments.embed`
 LOOPS_FILE = "loops.json"
@@ -108,15 +106,6 @@ def read_run(folder: Path) -> FinishedRun:
         text=read_text(folder / TEXT_FILE) if (folder / TEXT_FILE).is_file() else None,
         loops=_loops(folder / LOOPS_FILE, len(poses)),
     )
-
-
-@contextmanager
-def sound(what: str, remedy: str = "run again") -> Iterator[None]:
-    """Raise one ValueError for whatever is wrong with the content of a file that is read inside of the `with`."""
-    try:
-        yield
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{what} ({error!r}): {remedy}") from error
 
 
 def _check_metrics(path: Path, metrics: dict[str, Any]) -> None:

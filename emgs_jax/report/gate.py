@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from emgs_jax.io.files import atomic_write
-from emgs_jax.report.results import Estimate
+from emgs_jax.report.results import Estimate, sound
 from emgs_jax.report.tables import Row
 
 GATE_FORMAT = 1
@@ -78,7 +78,7 @@ def read_gate(path: str | os.PathLike) -> dict[str, Any]:
     remedy = "write one with python -m experiments.evaluate … write_gate=FILE"
     if not Path(path).is_file():
         raise ValueError(f"gate={path} is no file: {remedy}")
-    try:
+    with sound(f"gate={path} is no baseline", remedy):
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         if content["format"] != GATE_FORMAT:
             raise ValueError(f"format {content['format']}, not {GATE_FORMAT}")
@@ -88,8 +88,6 @@ def read_gate(path: str | os.PathLike) -> dict[str, Any]:
                     raise ValueError(f"{key} needs direction: lower or higher, and a tolerance of 0 or more")
                 float(rule["value"])
             entry["protocol"], [int(seed) for seed in entry["seeds"]]
-    except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"gate={path} is no baseline ({error!r}): {remedy}") from error
     return content["baseline"]
 
 

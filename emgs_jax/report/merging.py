@@ -97,14 +97,8 @@ def with_records(end: BackEnd, records: Sequence[FrameRecord], online: np.ndarra
 def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, list[int], dict[int, str]]:
     """Join all runs with the first one, each where it shows places of it or of one that is joined already.
 
-    Args:
-        has_truth: the true poses of all are in one world; False: they are left out.
-
-    Returns:
-        The run of all, the order in which their frames are in it, and why a run of these was not joined.
-
-    Raises:
-        ValueError: none can be joined with the first.
+    Returns the run of all, the order in which their frames are in it, and why a run of these was not joined. Without
+    `has_truth` the true poses are not in one world, and left out. ValueError where none can be joined with the first.
     """
     atlas, order, pending, reasons = runs[0].atlas, [0], [*range(1, len(runs))], {}
     while pending:
@@ -144,8 +138,7 @@ def numbered(atlas: Atlas) -> Atlas:
 def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[dict[str, Any], list[str]]:
     """Write a merged run into a new folder, with unit and world of the first run.
 
-    Returns:
-        Its metrics; and what there is to say: which run was not joined and why, and what could not be made.
+    Returns its metrics; and what there is to say: which run was not joined and why, and what could not be made.
     """
     read = [mergeable(folder) for folder in folders]
     run, order, reasons = merged(read, has_truth)

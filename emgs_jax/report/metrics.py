@@ -24,14 +24,12 @@ from emgs_jax.evaluation.reconstruction import (
 )
 from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import (
-    DistinctCells,
     LabelledPoints,
     SpooledLabels,
+    TrueLabels,
     align_labels,
     compare_labels,
-    label_cells,
     translate,
-    true_labels,
 )
 from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
@@ -64,10 +62,11 @@ class Scorer:
 
 def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior) -> Scorer:
     """Read the truth of a data set, each frame once."""
-    cells = None if compared_text(dataset, prior) is None else DistinctCells()
-    truth = true_cloud(dataset, evaluation, cells)
-    labels = None if cells is None else true_labels(cells, dataset, evaluation.voxel_m)
-    return Scorer(dataset, evaluation, truth, labels, prior)
+    labels = None
+    if compared_text(dataset, prior) is not None:
+        labels = TrueLabels(dataset, evaluation.voxel_m, evaluation.max_depth_m)
+    truth = true_cloud(dataset, evaluation, labels)
+    return Scorer(dataset, evaluation, truth, labels and labels.points(), prior)
 
 
 def compared_text(dataset: ReadableFrames, prior: Prior) -> Text | None:
@@ -75,14 +74,14 @@ def compared_text(dataset: ReadableFrames, prior: Prior) -> Text | None:
     return (tuple(prior.feature_names), prior.text_features) if dataset.classes and prior.feature_names else None
 
 
-def true_cloud(dataset: ReadableFrames, config: EvaluationConfig, cells: DistinctCells | None = None) -> Reference:
-    """The true points of the frames whose pose is known; `cells` takes the `label_cells` of each frame on the way."""
+def true_cloud(dataset: ReadableFrames, config: EvaluationConfig, labels: TrueLabels | None = None) -> Reference:
+    """The true points of the frames whose pose is known; `labels` take each frame on the way."""
 
     def frames() -> Iterator[Frame]:
         for row in range(len(dataset) if dataset.has_ground_truth else 0):
             frame = dataset[row]
-            if cells is not None:
-                cells.append(label_cells(frame, dataset, config.voxel_m, config.max_depth_m))
+            if labels is not None:
+                labels.append(frame)
             yield frame
 
     return reference(ground_truth_cloud(frames(), dataset.intrinsics, config), config)

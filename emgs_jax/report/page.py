@@ -29,17 +29,13 @@ _SCRIPTS = ("data.js", "vectors.js", "splats.js", "layers.js", "controls.js", "o
 
 
 def write_report(run: FinishedRun, dataset: Dataset | None, note: str = "") -> Path:
-    """Write report.html into the folder of a run; the same run gives the same bytes.
+    """Write report.html into the folder of a run, and return its path; the same run gives the same bytes.
+
+    ValueError where parts of the run do not fit each other; then nothing is written.
 
     Args:
         dataset: in use, for the images; None: the page has none.
         note: what could not be shown, and why.
-
-    Returns:
-        The path of the page.
-
-    Raises:
-        ValueError: parts of the run do not fit each other; nothing is written.
     """
     paths = placed_paths(run)
     layers, config = map_layers(run.map, run.text) | feature_layer(run.map), render_config(run)

@@ -17,9 +17,9 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.report.colors import to_bytes
-from emgs_jax.report.display import closed
 from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.report.html import jpeg
+from emgs_jax.report.layers import closed
 from emgs_jax.report.moving import with_moving
 
 WIDTH = 200  # pixels; a picture is not wider

@@ -18,12 +18,13 @@ from emgs_jax.report.columns import (
     metric_table,
     transposed,
 )
-from emgs_jax.report.finished_run import POLISH, FinishedRun, sound
+from emgs_jax.report.finished_run import POLISH, FinishedRun
 from emgs_jax.report.html import Head, commit_words
 from emgs_jax.report.moving import MUCH
 from emgs_jax.report.printout import polish_table
 from emgs_jax.report.provenance import RAW_PRIOR, length_words, lines_of
 from emgs_jax.report.repeat import Repeated
+from emgs_jax.report.results import sound
 
 MANY_LOST = 0.1  # share of the frames
 MAX_LOOPS = 500  # that are named

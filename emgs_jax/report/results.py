@@ -2,16 +2,28 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from emgs_jax.io.files import changes, jsonable
 from emgs_jax.report.provenance import RESULT_FORMAT, ROWS, prefix_of
 
 METRICS_FILE = "metrics.json"
 _PLACES = ("dataset.root", "compilation_cache", "checksums")  # say where things are, not what is computed
+
+
+@contextmanager
+def sound(what: str, remedy: str = "run again") -> Iterator[None]:
+    """Raise one ValueError for whatever is wrong with the content of a file that is read inside of the `with`."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError) as error:
+        raise ValueError(f"{what} ({error!r}): {remedy}") from error
 
 
 @dataclass(frozen=True)
@@ -42,11 +54,9 @@ def result_folder(out: Path, dataset: str, sequence: str, variant: str, seed: in
 
 def read_metrics(path: Path, remedy: str = "move its folder away or choose another out=FOLDER") -> dict[str, Any]:
     """Read a metrics.json of this version; any other raises ValueError, which says the remedy."""
-    try:
+    with sound(f"{path} is not the result of a run", remedy):
         metrics = json.loads(path.read_text(encoding="utf-8"))
         found = metrics["provenance"].get("format")
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is not the result of a run ({error!r}): {remedy}") from error
     if found != RESULT_FORMAT:
         raise ValueError(f"{path} was written by another version (format {found}, not {RESULT_FORMAT}): {remedy}")
     return metrics

@@ -48,15 +48,12 @@ def polish(
 ) -> dict[str, Any]:
     """Fit splats to all placed frames but the held-out ones; write them, and how the held-out ones look before, after.
 
+    Returns what polish.json says. ValueError where the map is empty, there is no frame to fit or to compare with, or
+    optax is not installed.
+
     Args:
         run: whose folder is written into.
         densify_config: how the run drew its map.
-
-    Returns:
-        What polish.json says.
-
-    Raises:
-        ValueError: the map is empty, there is no frame to fit or to compare with, or optax is not installed.
     """
     extra(*OPTAX)
     gaussians = confirmed(run.map)

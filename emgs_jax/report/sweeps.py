@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from emgs_jax.io.files import changes, jsonable, write_json
+from emgs_jax.report.results import sound
 
 FORMAT, VERSION = "emgs_jax.running.stacked", 1
 _REMEDY = "make it again in another folder (hydra.run.dir=…), or move this one away"
@@ -14,10 +15,8 @@ _REMEDY = "make it again in another folder (hydra.run.dir=…), or move this one
 
 def read_sweep(path: Path) -> dict[str, Any]:
     """Read a sweep.json of this version; any other raises ValueError."""
-    try:
+    with sound(f"{path} is damaged", _REMEDY):
         sweep = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged ({error}): {_REMEDY}") from error
     if not isinstance(sweep, dict) or (sweep.get("format"), sweep.get("version")) != (FORMAT, VERSION):
         raise ValueError(f"{path} is not a sweep of version {VERSION}: {_REMEDY}")
     return sweep

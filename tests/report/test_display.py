@@ -13,8 +13,8 @@ from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.render.composite import render
 from emgs_jax.render.densify import densify
-from emgs_jax.report.display import LARGEST, closing_covariances
 from emgs_jax.report.finished_run import read_run
+from emgs_jax.report.layers import LARGEST, closing_covariances
 from emgs_jax.report.splats import read_splats
 
 
