@@ -1,6 +1,7 @@
 """EuRoC MAV, and what has its layout (ASL): images of one camera on a rig, whose motion is known; no depth."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +18,7 @@ SOURCE = "EuRoC MAV dataset of the ASL at ETH Zurich, the zip of a sequence in A
 ORDER = (0, 1, 2, 4, 5, 6, 3)  # from x y z qw qx qy qz to TUM's order
 
 
+@dataclass(eq=False)
 class Euroc(PosedImages):
     """One camera of one sequence of EuRoC, straightened; without state_groundtruth_estimate0 there are no poses.
 
@@ -27,22 +29,15 @@ class Euroc(PosedImages):
         max_time_difference: seconds between an image and its pose.
     """
 
-    name = "euroc"
+    size: Sequence[int] = (376, 240)
+    camera: str = "cam0"
+    max_time_difference: Number = 0.02
 
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | None = None,
-        camera: str = "cam0",
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Sequence[int] = (376, 240),
-        max_time_difference: Number = 0.02,
-    ) -> None:
-        folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
-        solved = read_euroc(folder / "mav0", camera, check_tolerance(max_time_difference))
-        super().__init__(folder, solved, (start, stop, stride), size, str(sequence))
+    name, layout, source = "euroc", LAYOUT, SOURCE
+
+    def __post_init__(self) -> None:
+        folder = self._find(self.sequence)
+        self._take(folder, read_euroc(folder / "mav0", self.camera, check_tolerance(self.max_time_difference)))
 
 
 def read_euroc(folder: Path, camera: str, tolerance: float) -> Solved:

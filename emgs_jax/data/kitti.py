@@ -1,6 +1,7 @@
 """KITTI odometry: rectified images of a car, and the motion of its left grey camera; no depth."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,7 @@ LAYOUT = "root/{sequences/00/{image_2/, calib.txt, times.txt}, poses/00.txt}"
 SOURCE = "KITTI odometry benchmark: colour images, calibration files and ground truth poses, project page at KIT"
 
 
+@dataclass(eq=False)
 class Kitti(PosedImages):
     """One camera of one sequence of KITTI odometry; 11 to 21 have no poses.
 
@@ -25,26 +27,19 @@ class Kitti(PosedImages):
         root: folder that holds sequences/ and poses/.
         sequence: "00"; of 7 the two digits 07.
         camera: 0 and 1 are grey, 2 and 3 in colour, left and right.
-        start, stop, stride: which of the images, in order of their names.
     """
 
-    name = "kitti"
+    sequence: str | int | None = None
+    size: Sequence[int] = (480, 144)
+    camera: int = 2
 
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | int | None = None,
-        camera: int = 2,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Sequence[int] = (480, 144),
-    ) -> None:
-        name = None if sequence is None else str(sequence).zfill(2)
-        place = None if name is None else f"sequences/{name}"
-        folder = reading.find_sequence(root, place, LAYOUT, SOURCE)
-        solved = read_kitti(folder, folder.parents[1] / "poses" / f"{name}.txt", camera)
-        super().__init__(folder, solved, (start, stop, stride), size, str(name))
+    name, layout, source = "kitti", LAYOUT, SOURCE
+
+    def __post_init__(self) -> None:
+        self.sequence = None if self.sequence is None else str(self.sequence).zfill(2)
+        folder = self._find(self.sequence and f"sequences/{self.sequence}")
+        truth = folder.parents[1] / "poses" / f"{self.sequence}.txt"
+        self._take(folder, read_kitti(folder, truth, self.camera))
 
 
 def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from PIL import ExifTags, Image
 
-from emgs_jax.data.base import BadFrameError, Dataset
+from emgs_jax.data.base import BadFrameError
 
 Number = int | float  # a YAML value may be written 585 or 585.0
 Size = tuple[int, int]  # (width, height)
@@ -393,11 +393,6 @@ def check_position(position: Float[np.ndarray, " 3"], where: object) -> None:
             f"{where} has a position of [{shown}] m, and a map holds positions in float32 up to {MAX_POSITION_M:g} m: "
             "where the trajectory is geo-referenced subtract one position from all of its lines, else correct this one"
         )
-
-
-def all_files(dataset: Dataset) -> set[Path]:
-    """Return all files that the frames in use are read from."""
-    return {file for index in range(len(dataset)) for file in dataset.files(index)}
 
 
 def fingerprint(root: Path, files: Iterable[Path], options: dict[str, object]) -> str:

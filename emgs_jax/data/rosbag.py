@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -28,52 +29,45 @@ DEPTHS = re.compile(r"(16|32|64)[USF]C[1-4]$")  # also where they are compressed
 RECTIFIED = re.compile(r"(^|[/_])rect([/_]|$)")  # a topic, as image_proc and others name it
 
 
+@dataclass(eq=False)
 class RosBag(Straightened):
     """The images of one topic.
 
     Args:
         sequence: bag below root; None = root itself.
+        start, stop, stride: which of the images, in the order in which they were taken.
         topic: of sensor_msgs/Image or CompressedImage; None = the only one.
         info_topic: of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one.
         intrinsics: as `Images` takes them; None = those of the first CameraInfo.
-        start, stop, stride: which of the images, in the order in which they were taken.
     """
 
-    name = "rosbag"
+    topic: str | None = None
+    info_topic: str | None = None
+    intrinsics: Given | None = None
 
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | None = None,
-        topic: str | None = None,
-        info_topic: str | None = None,
-        intrinsics: Given | None = None,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Sequence[int] = (320, 240),
-    ) -> None:
-        self._path = reading.find_sequence(root, "." if sequence is None else sequence, LAYOUT, "ros2 bag record")
+    name, layout, source = "rosbag", LAYOUT, "ros2 bag record"
+
+    def __post_init__(self) -> None:
+        self._path = self._find(self.sequence or ".")
+        self._folder = self._path.parent
         with _opened(self._path) as bag:
-            self._topic = _topic_of(bag, (RAW, COMPRESSED), topic, self._path, "topic")
+            self._topic = _topic_of(bag, (RAW, COMPRESSED), self.topic, self._path, "topic")
             received, stamps = _times(bag, self._topic)
-            info = None if intrinsics is not None else _camera_info(bag, self._topic, info_topic, self._path)
+            info = None if self.intrinsics is not None else _camera_info(bag, self._topic, self.info_topic, self._path)
         first: dict[int, int] = {}  # several may have one time
         places = [(time, row - first.setdefault(time, row)) for row, time in enumerate(received)]
         taken, note = when_taken(received, stamps)
         order = sorted(range(len(taken)), key=lambda row: taken[row])
-        chosen = reading.select(len(order), start, stop, stride, f"{self._path}, topic {self._topic},")
+        chosen = self._select(len(order), f"{self._path}, topic {self._topic},")
         self._places = [places[order[place]] for place in chosen]
         self._taken = [taken[order[place]] for place in chosen]
         self._tones = find_tones(self._picture, len(self))
         raw_size = self._first_size()
         if info is None:
-            lens = find_lens(intrinsics, Pictures(raw_size, len(self), self._shown))
+            lens = find_lens(self.intrinsics, Pictures(raw_size, len(self), self._shown))
         else:
             lens = to_lens(info, raw_size, f"CameraInfo of {self._path}", {"source": "CameraInfo"})
-        self._use(lens, raw_size, size, note)
-        self._folder = self._path.parent
-        self.sequence = self._path.resolve().name if sequence is None else str(sequence)
+        self._use(lens, raw_size, note)
 
     def __len__(self) -> int:
         return len(self._places)

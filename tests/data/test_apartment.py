@@ -15,7 +15,7 @@ SEEDS_AND_WALKS = [*((0, walk) for walk in WALKS), (1, "two_laps"), (1, "twin_ro
 
 @cache
 def apartment(walk: str = "two_laps", seed: int = 0) -> Apartment:
-    return Apartment(seed, walk, size=(80, 60))
+    return Apartment(seed, walk=walk, size=(80, 60))
 
 
 @cache
@@ -204,7 +204,7 @@ def test_fewer_frames_and_a_stride_go_the_same_way():
     [
         ({"walk": "round"}, "walk must be one of two_laps, figure_of_eight, out_and_back, twin_rooms, corridor"),
         ({"seed": -1}, "dataset.seed must be 0 or more .* got -1"),
-        ({"num_frames": 0}, "dataset.num_frames 1 or more, or null"),
+        ({"num_frames": 0}, "dataset.num_frames 1 or more, got 0, 0, 0"),
         ({"stride": 0}, "dataset.stride must be at least 1"),
     ],
 )

@@ -33,7 +33,8 @@ class Stage(RayCast):
         (board,) = furniture.join("box", furniture.box((*size, 0.1), (0, 0, 0)))
         mover = Mover(board, poses @ T_camera_board, np.full(NUM_FRAMES, MOVES, np.uint8))
         scene = Scene(parts, draw_looks(parts, rng))
-        super().__init__("stage", scene, poses, range(NUM_FRAMES), (64, 48), None, [mover])
+        super().__init__(size=(64, 48))
+        self._show("stage", scene, poses, [mover])
 
 
 AWAY = np.array([0.0, 0.0, -5.0])  # behind the camera
