@@ -65,7 +65,8 @@ def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
     if truth is not None:
         rows = read_rows(truth, len(paths))
         poses = [pose_of(row, f"{truth}, line {line}:", T_first_camera) for line, row in enumerate(rows, 1)]
-    times = [number_of(row, f"{clock}, line {line}:") for line, row in enumerate(read_rows(clock, len(paths)), 1)]
+    clocked = enumerate(read_rows(clock, len(paths)), 1)
+    times = [float(_numbers(row, 1, f"{clock}, line {line}:")[0]) for line, row in clocked]
     files = calibration, clock, *([] if truth is None else [truth])
     return Solved(paths, poses, intrinsics, truth or calibration, files, times)
 
@@ -98,11 +99,6 @@ def pose_of(row: str, where: str, T_first_camera: Pose) -> Pose | None:
         raise BadFrameError(f"{where} {row[:80]!r} must be 12 numbers, the upper part of a pose: fetch the file again")
     pose = reading.as_motion(f"{row} 0 0 0 1", where)
     return None if pose is None else pose @ T_first_camera
-
-
-def number_of(text: str, where: str) -> float:
-    """A finite number."""
-    return float(_numbers(text, 1, where)[0])
 
 
 def _numbers(text: str, count: int, where: str) -> Float[np.ndarray, " n"]:

@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from PIL import ExifTags, Image
+from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import BadFrameError
 
@@ -300,36 +301,24 @@ def first_size(paths: Iterable[Path], where: object, flags: int = 0) -> Size:
 
 def transparency_note(paths: Iterable[Path]) -> str | None:
     """Words where an image is transparent in places, about the first such; files that cannot be read are left out."""
-    return next((note for path in paths if _may_be_transparent(path) and (note := _transparency(path))), None)
-
-
-def _head(path: Path) -> bytes:
-    """The first bytes of a file, with the header and the tables of a PNG; none where it cannot be read."""
-    try:
-        with open(path, "rb") as file:
-            return file.read(2048)
-    except OSError:
-        return b""
+    return next((note for path in paths if (note := _transparency(path))), None)
 
 
 def may_be_deep(path: Path) -> bool:
     """Test by its first bytes whether an image may have more than 8 bits; only these are decoded to look."""
-    head = _head(path)
-    return head[24:25] == b"\x10" if head.startswith(b"\x89PNG") else not head.startswith(EIGHT_BITS)
-
-
-def _may_be_transparent(path: Path) -> bool:
-    """Test likewise whether a file may have an alpha channel, or a colour that stands for nothing (a PNG's tRNS)."""
-    head = _head(path)
-    if head.startswith(b"\x89PNG"):
-        return head[25:26] in (b"\x04", b"\x06") or b"tRNS" in head.partition(b"IDAT")[0]
-    return not head.startswith((b"\xff\xd8", b"BM"))
+    try:
+        with open(path, "rb") as file:
+            head = file.read(25)
+    except OSError:
+        return True
+    return head[24:] == b"\x10" if head.startswith(b"\x89PNG") else not head.startswith(EIGHT_BITS)
 
 
 def _transparency(path: Path) -> str | None:
     try:
         with Image.open(path) as image:
-            if image.mode == "F" or image.convert("RGBA").getchannel("A").getextrema()[0] >= 255:
+            has_some = "A" in image.getbands() or "transparency" in image.info
+            if not has_some or image.convert("RGBA").getchannel("A").getextrema()[0] >= 255:
                 return None
     except (OSError, ValueError, SyntaxError):  # a damaged image, whose turn comes when it is read
         return None
@@ -373,6 +362,15 @@ def as_motion(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded
+    return pose
+
+
+def rigid(position: Sequence[float], quaternion: Sequence[float]) -> Float[np.ndarray, "4 4"]:
+    """The motion to a position, turned by a quaternion x, y, z, w; ValueError where one is not finite or this not 1."""
+    if not np.isfinite(position).all() or not abs(math.hypot(*quaternion) - 1) <= RIGID_TOLERANCE:
+        raise ValueError("its quaternion has not length 1")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
     return pose
 
 

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from jaxtyping import Float, Float32
-from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
 from emgs_jax.data.backprojection import backproject
@@ -125,13 +124,10 @@ def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"
             w, x, y, z, *translation = (float(number) for number in numbers[:7])
             if not np.isfinite([w, x, y, z, *translation]).all():  # the camera was lost there
                 continue
-            T_camera_world = np.eye(4)
-            T_camera_world[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-            T_camera_world[:3, 3] = translation
+            T_world_camera = np.linalg.inv(reading.rigid(translation, (x, y, z, w)))
         except ValueError as error:
             form = "seq-XX/frame-000000.color.png qw qx qy qz tx ty tz focal"
             raise BadFrameError(f"{path} line {row} is no pose of the form {form}: {reading.REMEDY}") from error
-        T_world_camera = np.linalg.inv(T_camera_world)
         reading.check_position(T_world_camera[:3, 3], path)
         found[frame_number(Path(name))] = T_world_camera
     if not found:

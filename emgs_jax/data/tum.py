@@ -9,7 +9,6 @@ from typing import Any, ClassVar
 
 import numpy as np
 from jaxtyping import Float, Int32
-from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
@@ -207,11 +206,11 @@ def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"] | 
         raise BadFrameError(f"{where} {' '.join(words)!r} must be tx ty tz qx qy qz qw: {REMEDY}") from error
     if not np.isfinite(values).all():
         return None
-    if not np.abs(values[3:]).max() < 2 or abs(np.linalg.norm(values[3:]) - 1) > reading.RIGID_TOLERANCE:
-        raise BadFrameError(f"{where} {' '.join(words)!r} is no pose, as its quaternion has not length 1: {REMEDY}")
+    try:
+        pose = reading.rigid(values[:3], values[3:])
+    except ValueError as error:
+        raise BadFrameError(f"{where} {' '.join(words)!r} is no pose, as {error}: {REMEDY}") from error
     reading.check_position(values[:3], where)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
     return pose
 
 
