@@ -159,11 +159,7 @@ def load_pycolmap(otherwise: str) -> ModuleType:
 
 
 def to_pycolmap(camera: Calibration, size: Size) -> Any:
-    """pycolmap's camera, whose pixels have integers at their centres.
-
-    Raises:
-        ValueError: pycolmap is not installed.
-    """
+    """pycolmap's camera, whose pixels have integers at their centres; ValueError where it is not installed."""
     pycolmap = load_pycolmap(
         "images with lens distortion are straightened by pycolmap, which is not installed (for Linux on ARM there "
         "is no wheel): build it from the source of COLMAP, or undistort the images on another machine"

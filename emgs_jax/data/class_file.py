@@ -31,14 +31,11 @@ class ClassFile:
     positions: Mapping[int, int] | None
 
     def positions_of(self, ids: np.ndarray, what: object) -> np.ndarray:
-        """Position in `names` of each id (n,), -1 = no class.
+        """Position in `names` of each id (n,), -1 = no class; ValueError where the file has no ids, or some id no name.
 
         Args:
             ids: whole numbers.
             what: names their file in messages.
-
-        Raises:
-            ValueError: the file has no ids, or some id has no name.
         """
         if self.positions is None:
             raise ValueError(f"{self.path} has names without ids, which {what} needs: {REMEDY}")

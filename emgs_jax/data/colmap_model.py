@@ -162,11 +162,7 @@ def _pose(values: Sequence[float], place: str) -> np.ndarray:
 
 
 def check_whole(folder: Path) -> None:
-    """Check that the binary files of a model do not end too soon; pycolmap would not end.
-
-    Raises:
-        ValueError: one does.
-    """
+    """Check that the binary files of a model do not end too soon, which is a ValueError: pycolmap would not end."""
     for path in sorted(folder.glob("*.bin")):
         if skip := _SKIP.get(path.stem):
             for record in _Records(path):

@@ -97,7 +97,7 @@ def pose_of(row: str, where: str, T_first_camera: Pose) -> Pose | None:
     """T_world_camera of a row of twelve numbers, the upper part of that of camera 0; None where it is inf or nan."""
     if len(row.split()) != 12:
         raise BadFrameError(f"{where} {row[:80]!r} must be 12 numbers, the upper part of a pose: fetch the file again")
-    pose = reading.as_motion(f"{row} 0 0 0 1", where)
+    pose = reading.as_pose(f"{row} 0 0 0 1", where, may_be_far=True)
     return None if pose is None else pose @ T_first_camera
 
 

@@ -4,8 +4,9 @@ import hashlib
 import math
 import struct
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -288,12 +289,14 @@ def check_raw_size(image: np.ndarray, raw_size: Size | None, path: object) -> No
         )
 
 
-def first_size(paths: Iterable[Path], where: object, flags: int = 0) -> Size:
-    """(width, height) of the first image that can be read, as `read_color` does."""
+def first_size(
+    images: Iterable[Any], where: object, flags: int = 0, read: Callable[[Any], np.ndarray] | None = None
+) -> Size:
+    """(width, height) of the first image that can be read; `where` names them all; None = files as of `read_color`."""
     reasons = []
-    for path in paths:
+    for image in images:
         try:
-            return decode(path, OWN_BITS | flags).shape[1::-1]
+            return (decode(image, OWN_BITS | flags) if read is None else read(image)).shape[1::-1]
         except BadFrameError as error:
             reasons.append(str(error))
     raise ValueError(f"{where}: none of its {len(reasons)} images can be read: {'; '.join(dict.fromkeys(reasons[:3]))}")
@@ -328,19 +331,12 @@ def _transparency(path: Path) -> str | None:
     )
 
 
-def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
-    """`as_motion`; ValueError where it is farther away than positions can be held."""
-    pose = as_motion(text, where)
-    if pose is not None:
-        check_position(pose[:3, 3], where)
-    return pose
-
-
-def as_motion(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
+def as_pose(text: str, where: object, may_be_far: bool = False) -> Float[np.ndarray, "4 4"] | None:
     """A rigid 4x4 transform from 16 numbers, row by row; None where they are inf or nan, which means lost tracking.
 
     Raises:
         BadFrameError: they are no pose.
+        ValueError: it is farther away than positions can be held.
     """
     try:
         pose = np.array([float(token) for token in text.split()], np.float64).reshape(4, 4)
@@ -362,6 +358,8 @@ def as_motion(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded
+    if not may_be_far:
+        check_position(pose[:3, 3], where)
     return pose
 
 

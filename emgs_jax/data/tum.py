@@ -69,10 +69,10 @@ class TumLayout(Straightened):
         chosen = self._select(len(times), f"{self._lists['rgb']} (layout {LAYOUT})")
         self._times, self._images = times[chosen], [find_image(self._folder, names[i][0]) for i in chosen]
         self._depth_scale = reading.check_depth_scale(self.depth_scale)
-        self._depths = self._nearest("depth", "depth", 2)
-        self._poses = self._nearest("groundtruth", "pose", 8)
-        if self._depths is not None:
-            self._depths = [found and find_image(self._folder, found[0][0]) for found in self._depths]
+        tolerance = check_tolerance(self.max_time_difference)
+        depths = nearest_lines(self._lists["depth"], 2, self._times, tolerance, "depth")
+        self._depths = depths and [found and find_image(self._folder, found[0][0]) for found in depths]
+        self._poses = nearest_lines(self._lists["groundtruth"], 8, self._times, tolerance, "pose")
         self.has_ground_truth = self._depths is not None and self._poses is not None
         is_own = self.intrinsics is None
         raw_size = RAW_SIZE if is_own else reading.first_size(self._images, self._folder)
@@ -80,15 +80,6 @@ class TumLayout(Straightened):
         given = find_calibration(self.sequence, self.intrinsics, self.distortion, self.calibrations)
         lens = find_lens(given, pictures_of(self._images, raw_size, self._tones))
         self._use(lens, raw_size, back_note(self._lists["rgb"], times, lines), reading.transparency_note(self._images))
-
-    def _nearest(self, name: str, what: str, columns: int) -> list[tuple[list[str], int] | None] | None:
-        """The words and the line of a list that are nearest in time to each image; None where there is no list."""
-        if not self._lists[name].exists():
-            return None
-        times, words, lines = read_list(self._lists[name], columns)
-        tolerance = check_tolerance(self.max_time_difference)
-        rows = matched_rows(self._times, times, tolerance, (what, self._lists[name]))
-        return [None if row < 0 else (words[row], lines[row]) for row in rows]
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
         if self._poses is None or self._poses[index] is None:
@@ -172,6 +163,17 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
         numbers.append(number)
     order = np.argsort(times, kind="stable")
     return in_seconds(np.array(times, np.float64)[order]), [words[i] for i in order], [numbers[i] for i in order]
+
+
+def nearest_lines(
+    path: Path, columns: int, times: Float[np.ndarray, " n"], tolerance: float, what: str
+) -> list[tuple[list[str], int] | None] | None:
+    """Words and line of a `read_list` nearest to each time, None where none is near; None where there is no list."""
+    if not path.exists():
+        return None
+    known, words, lines = read_list(path, columns)
+    rows = matched_rows(times, known, tolerance, (what, path))
+    return [None if row < 0 else (words[row], lines[row]) for row in rows]
 
 
 def back_note(path: Path, times: Float[np.ndarray, " n"], lines: Sequence[int]) -> str | None:
