@@ -205,6 +205,7 @@ def test_fewer_frames_and_a_stride_go_the_same_way():
         ({"walk": "round"}, "walk must be one of two_laps, figure_of_eight, out_and_back, twin_rooms, corridor"),
         ({"seed": -1}, "dataset.seed must be 0 or more .* got -1"),
         ({"num_frames": 0}, "dataset.num_frames 1 or more, got 0, 0, 0"),
+        ({"movers": -1}, "must be 0 or more .dataset.movers likewise. .* got 0, -1"),
         ({"stride": 0}, "dataset.stride must be at least 1"),
     ],
 )
