@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float
 
-from emgs_jax.data import furniture, room
+from emgs_jax.data import furniture
 from emgs_jax.data.furnishing import at_wall, furnish
 from emgs_jax.data.furniture import Part, moved
 from emgs_jax.data.looks import copied, draw_looks
@@ -51,7 +51,7 @@ class Apartment(RayCast):
     walk: str = "two_laps"
 
     name, version = "apartment", 1
-    classes = (*room.CLASSES, "door", "bed", "plant")
+    classes = (*furniture.CLASSES, "door", "bed", "plant")
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -59,9 +59,8 @@ class Checksums:
 def find_checksums(checksums: str | None, dataset: Dataset) -> Checksums | None:
     """The list for a data set, None where there is none; ValueError where it cannot be read or lacks an image.
 
-    Args:
-        checksums: `off`; a file; or `auto`, SHA256SUMS in the folder of the first image or one above, if it is there.
-        dataset: of the images, each of which has to be in the list.
+    It is `off`; a file; or `auto`, SHA256SUMS in the folder of the first image or one above, if it is there. Each image
+    has to be in the list.
     """
     if checksums in ("off", None, False) or not dataset.files(0):
         return None

@@ -33,9 +33,7 @@ class ClassFile:
     def positions_of(self, ids: np.ndarray, what: object) -> np.ndarray:
         """Position in `names` of each id (n,), -1 = no class; ValueError where the file has no ids, or some id no name.
 
-        Args:
-            ids: whole numbers.
-            what: names their file in messages.
+        `what` names the file of the ids in messages.
         """
         if self.positions is None:
             raise ValueError(f"{self.path} has names without ids, which {what} needs: {REMEDY}")

@@ -45,9 +45,7 @@ class Kitti(PosedImages):
 def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
     """The images of a camera and its poses.
 
-    Args:
-        truth: poses of camera 0; a poses.txt in `folder` does as well, and without either there is none.
-        camera: 0 to 3.
+    `truth` has those of camera 0; a poses.txt in `folder` does as well, and without either there is none.
 
     Raises:
         FileNotFoundError: a file of the layout is missing.

@@ -46,9 +46,7 @@ class LabelFolder:
     def read(self, image: str | Path, raw_size: tuple[int, int] | None = None) -> Int32[np.ndarray, "h w"]:
         """Position in `names` of each pixel of the image, -1 where there is no class.
 
-        Args:
-            image: file of the image, whose name is looked for.
-            raw_size: (width, height) that it must have.
+        The image's name is looked for; `raw_size` is the (width, height) that it must have.
 
         Raises:
             BadFrameError: the file cannot be read, is no image of ids or of another size, or has an id without a name.

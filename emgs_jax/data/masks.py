@@ -58,7 +58,7 @@ class Masks:
         return {stem(path.name): path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
 
     def check(self, names: Sequence[str]) -> None:
-        """Raise ValueError where an image of these names has no mask."""
+        """ValueError where an image of these names has no mask."""
         missing = [] if self.folder is None else [name for name in names if self._file(name) is None]
         if missing:
             raise ValueError(

@@ -108,12 +108,8 @@ def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"
     of pseudo ground truth in visual camera re-localisation", ICCV 2021), in lines "seq-XX/frame-000000.color.png qw qx
     qy qz tx ty tz focal", world -> colour camera; # begins a comment.
 
-    Args:
-        sequence: seq-XX; lines of other sequences are left out.
-
-    Raises:
-        BadFrameError: a line is none.
-        ValueError: no line is of the sequence.
+    Lines of other sequences than `sequence` are left out; BadFrameError where a line is none, ValueError where none is
+    of the sequence.
     """
     found = {}
     for row, line in enumerate(reading.read_text(path).splitlines(), start=1):

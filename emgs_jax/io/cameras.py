@@ -29,12 +29,9 @@ def save_colmap(
     """Write cameras.txt, images.txt and points3D.txt of one pinhole camera.
 
     Args:
-        folder: that is there.
-        camera: of all images.
         names: of the image files.
         T_world_camera: (n, 4, 4), metres.
-        points: (p, 3), metres, world; written without tracks.
-        colors: (p, 3), RGB, uint8.
+        points, colors: (p, 3), metres, world, and RGB, uint8; written without tracks.
     """
     poses = np.linalg.inv(np.asarray(T_world_camera, np.float64))
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
@@ -67,7 +64,6 @@ def save_transforms(
     """Write transforms.json of one pinhole camera.
 
     Args:
-        camera: of all images.
         names: of the image files, from the folder of `path`.
         T_world_camera: (n, 4, 4), OpenCV axes, metres.
         points_file: a PLY in the same world, from the folder of `path`.
