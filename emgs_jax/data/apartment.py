@@ -39,15 +39,14 @@ Copies = list[Float[np.ndarray, " 3"]]  # where the copies of a group of objects
 
 @dataclass(eq=False)
 class Apartment(RayCast):
-    """Six furnished rooms, a hall and a gallery, walked through at eye level: 7 cm a frame, less round a corner.
+    """Six furnished rooms, a hall and a gallery, walked through at eye level.
 
-    Args:
-        seed: rooms, furniture and colours, the same for every walk.
-        num_frames: None = 7 cm apart, some 280 to 560.
-        walk: two_laps through four rooms; figure_of_eight through a doorway; out_and_back, which sees everything from
-            the other side; twin_rooms, two that look alike; corridor, which looks the same every 3 m.
+    Rooms, furniture and colours are the same for every walk of a seed. Without `num_frames` there are some 280 to 560,
+    7 cm apart, less round a corner.
     """
 
+    # two_laps through four rooms; figure_of_eight through a doorway; out_and_back, which sees everything from the other
+    # side; twin_rooms, two that look alike; corridor, which looks the same every 3 m
     walk: str = "two_laps"
 
     name, version = "apartment", 1

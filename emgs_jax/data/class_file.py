@@ -19,15 +19,11 @@ REMEDY = "give a name a line, `id name` a line, or YAML with class_names_reduced
 
 @dataclass(frozen=True)
 class ClassFile:
-    """Classes of a file.
-
-    Args:
-        names: of the classes, each once.
-        positions: by id of the data set, the position in `names`, -1 = no class; None where the file has no ids.
-    """
+    """Classes of a file."""
 
     path: str
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the classes, each once
+    # by id of the data set, the position in `names`, -1 = no class; None where the file has no ids
     positions: Mapping[int, int] | None
 
     def positions_of(self, ids: np.ndarray, what: object) -> np.ndarray:

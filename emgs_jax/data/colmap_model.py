@@ -23,18 +23,12 @@ Image = tuple[str, int, np.ndarray]  # name, camera and world → camera (4, 4)
 
 @dataclass(frozen=True)
 class SparseModel:
-    """The cameras and images of a model.
+    """The cameras and images of a model."""
 
-    Args:
-        cameras: by id.
-        names: of the image files, below the folder of images.
-        T_world_camera: (n, 4, 4), in the model's unit.
-    """
-
-    cameras: dict[int, Calibration]
-    names: list[str]
+    cameras: dict[int, Calibration]  # by id
+    names: list[str]  # of the image files, below the folder of images
     camera_ids: list[int]
-    T_world_camera: np.ndarray
+    T_world_camera: np.ndarray  # (n, 4, 4), in the model's unit
     files: tuple[Path, ...]
 
 
@@ -65,6 +59,10 @@ class _Records:
             raise ValueError(f"{self._path} is damaged: it ends within a record; export the model again")
         self._place += size
         return self._data[self._place - size : self._place]
+
+
+def is_model(folder: Path) -> bool:
+    return any(all((folder / name).is_file() for name in names) for names in (TEXT, BINARY))
 
 
 def load_colmap(folder: Path) -> SparseModel:

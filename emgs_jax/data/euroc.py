@@ -18,18 +18,14 @@ ORDER = (0, 1, 2, 4, 5, 6, 3)  # from x y z qw qx qy qz to TUM's order
 
 @dataclass(eq=False)
 class Euroc(PosedImages):
-    """One camera of one sequence of EuRoC, straightened; without state_groundtruth_estimate0 there are no poses.
+    """One camera of one sequence, such as "MH_01_easy", straightened; images of data.csv are in order of time.
 
-    Args:
-        sequence: "MH_01_easy".
-        camera: "cam0" (left) or "cam1".
-        start, stop, stride: which of the images in data.csv, in order of time.
-        max_time_difference: seconds between an image and its pose.
+    Without state_groundtruth_estimate0 there are no poses.
     """
 
     size: Sequence[int] = (376, 240)
-    camera: str = "cam0"
-    max_time_difference: Number = 0.02
+    camera: str = "cam0"  # "cam0" (left) or "cam1"
+    max_time_difference: Number = 0.02  # seconds between an image and its pose
 
     name, layout, source = "euroc", LAYOUT, SOURCE
 

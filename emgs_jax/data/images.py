@@ -21,17 +21,11 @@ LAYOUT = (
 
 @dataclass(eq=False)
 class Images(Straightened):
-    """Your own images.
+    """Your own images, in natural order of their names, or a video; sequence None = root itself is folder or file."""
 
-    Args:
-        root: folder of images or video file.
-        sequence: folder or file below root; None = root itself.
-        start, stop, stride: which of the images that are there, in natural order of their names.
-        intrinsics: required. fx, fy, cx, cy in pixels of the images on disk, where they are distorted followed by k1,
-            k2, p1, p2 and maybe k3; the name of a model of COLMAP and its parameters; or a calibration file, "exif" or
-            "estimate", see `intrinsics.find_lens`.
-    """
-
+    # required. fx, fy, cx, cy in pixels of the images on disk, where they are distorted followed by k1, k2, p1, p2 and
+    # maybe k3; the name of a model of COLMAP and its parameters; or a calibration file, "exif" or "estimate", see
+    # `intrinsics.find_lens`
     intrinsics: Given | None = None
 
     name, layout, source = "images", LAYOUT, "your own recording"

@@ -19,19 +19,14 @@ SOURCE = "KITTI odometry benchmark: colour images, calibration files and ground 
 
 @dataclass(eq=False)
 class Kitti(PosedImages):
-    """One camera of one sequence of KITTI odometry; 11 to 21 have no poses.
+    """One camera of one sequence of KITTI odometry below root, which has sequences/ and poses/; 11 to 21 have no poses.
 
     The world is that of poses/00.txt: the left grey camera at the first image of the sequence.
-
-    Args:
-        root: folder that holds sequences/ and poses/.
-        sequence: "00"; of 7 the two digits 07.
-        camera: 0 and 1 are grey, 2 and 3 in colour, left and right.
     """
 
-    sequence: str | int | None = None
+    sequence: str | int | None = None  # "00"; of 7 the two digits 07
     size: Sequence[int] = (480, 144)
-    camera: int = 2
+    camera: int = 2  # 0 and 1 are grey, 2 and 3 in colour, left and right
 
     name, layout, source = "kitti", LAYOUT, SOURCE
 

@@ -20,19 +20,14 @@ MAX_STRETCH = 0.02  # relative difference of the sides' ratio, of a mask and its
 
 @dataclass(frozen=True)
 class Masks:
-    """Masks in a folder, each with the name of its image and the same sides or fewer pixels.
+    """Masks in a folder, each with the name of its image and the same sides or fewer pixels."""
 
-    Args:
-        folder: of images; None: no pixel is left out.
-        classes: names of what is left out, where the images hold ids of classes, see `LabelFolder`; None: what is black
-            is left out, as for COLMAP and nerfstudio.
-        names: file that names the ids, see `data.class_file`; needed with `classes`.
-        border: pixels around what is left out that are left out, too.
-    """
-
-    folder: str | None = None
+    folder: str | None = None  # of images; None: no pixel is left out
+    # names of what is left out, where the images hold ids of classes, see `LabelFolder`; None: what is black is left
+    # out, as for COLMAP and nerfstudio
     classes: Sequence[str] | None = None
-    names: str | None = None
+    names: str | None = None  # file that names the ids, see `data.class_file`; needed with `classes`
+    # pixels around what is left out that are left out, too
     border: int = field(default=2, metadata=ranged(low=0, high=1000))
 
     def __post_init__(self) -> None:

@@ -15,7 +15,7 @@ from jaxtyping import Float
 
 from emgs_jax.data import reading
 from emgs_jax.data.calibration_files import Calibration, read_calibration
-from emgs_jax.data.colmap_model import BINARY, TEXT, SparseModel, load_colmap
+from emgs_jax.data.colmap_model import SparseModel, is_model, load_colmap
 from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_order, times_of
 from emgs_jax.data.intrinsics import to_lens
 from emgs_jax.data.straightened import Straightened
@@ -30,20 +30,14 @@ MODEL_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0")  # sparse/0 stand
 
 @dataclass(frozen=True)
 class Solved:
-    """Images of one camera with the poses and the calibration that another program solved for.
-
-    Args:
-        poses: T_world_camera of each, in the program's unit; None where there is none.
-        camera: of all of them.
-        source: the file that poses and camera come from.
-        times: seconds of each, where the images stand in order of time; None = from their names.
-    """
+    """Images of one camera with the poses and the calibration that another program solved for."""
 
     images: list[Path]
-    poses: list[Pose | None]
-    camera: Calibration
-    source: Path
+    poses: list[Pose | None]  # T_world_camera of each, in the program's unit; None where there is none
+    camera: Calibration  # of all of them
+    source: Path  # the file that poses and camera come from
     files: tuple[Path, ...]
+    # seconds of each, where the images stand in order of time; None = from their names
     times: list[float] | None = None
     note: str | None = None
 
@@ -91,16 +85,11 @@ def in_order(solved: Solved) -> tuple[list[int], list[float], str | None]:
 
 @dataclass(eq=False)
 class Colmap(PosedImages):
-    """A project of COLMAP: the images that are registered in a sparse model, of one camera.
+    """A project of COLMAP in root or root/sequence: the images that are registered in a sparse model, of one camera."""
 
-    Args:
-        sequence: folder below root; None = root itself.
-        model: folder of the model below that; None = the first of MODEL_FOLDERS that has one, of several the largest.
-        images: folder of the images below that.
-    """
-
+    # folder of the model below that; None = the first of MODEL_FOLDERS that has one, of several the largest
     model: str | None = None
-    images: str = "images"
+    images: str = "images"  # folder of the images below that
 
     name, layout, source = "colmap", COLMAP_LAYOUT, "COLMAP's project"
 
@@ -124,21 +113,14 @@ def find_model(folder: Path, model: str | None) -> SparseModel:
     """Read a sparse model, of several the largest, or raise an error that names where one was looked for."""
     places = [folder / name for name in (MODEL_FOLDERS if model is None else (model,))]
     for place in places:
-        beside = [place] if model is not None or place.name != "0" else _numbered(place.parent)
-        if there := [other for other in beside if _has_model(other)]:
-            return max(map(load_colmap, there), key=lambda found: len(found.names))
+        beside = [place]
+        if model is None and place.name == "0":  # what COLMAP could not join is in several that are numbered
+            numbered = (path for path in place.parent.glob("*") if path.name.isdecimal())
+            beside = sorted(numbered, key=lambda path: int(path.name))
+        if there := [load_colmap(folder) for folder in beside if is_model(folder)]:
+            return max(there, key=lambda found: len(found.names))
     looked = ", ".join(str(place) for place in places)
     raise FileNotFoundError(f"no cameras and images (.txt or .bin) in {looked}; expected the layout {COLMAP_LAYOUT}")
-
-
-def _has_model(place: Path) -> bool:
-    return any(all((place / name).is_file() for name in names) for names in (TEXT, BINARY))
-
-
-def _numbered(folder: Path) -> list[Path]:
-    """The models that COLMAP numbers: what it could not join is in several, and the first need not be the largest."""
-    found = (path for path in folder.glob("*") if path.name.isdecimal())
-    return sorted(found, key=lambda path: int(path.name))
 
 
 def read_colmap(found: SparseModel, folder: Path) -> Solved:

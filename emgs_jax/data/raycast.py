@@ -33,24 +33,17 @@ class RayCast:
     """A data set whose frames are cast when they are asked for: each depends on its pose only, not on those before.
 
     A built-in scene is a subclass that names itself, its classes and its version, and says what to `_show`.
-
-    Args:
-        seed: of all that is drawn, 0 or more.
-        num_frames: images along the path, which stays the same: more frames are nearer to each other.
-        start, stop, stride: which of these images are in use.
-        size: (width, height).
-        intrinsics: fx, fy, cx, cy at `size`; None = .82 times the width and the centre.
-        movers: how many things move, see `build_movers`.
     """
 
-    seed: int = 0
-    num_frames: int | None = None
+    seed: int = 0  # of all that is drawn, 0 or more
+    num_frames: int | None = None  # images along the path, which stays the same: more frames are nearer to each other
+    # start, stop, stride: which of these images are in use
     start: int = 0
     stop: int | None = None
     stride: int = 1
-    size: Sequence[int] = (320, 240)
-    intrinsics: Sequence[Number] | None = None
-    movers: int = 0
+    size: Sequence[int] = (320, 240)  # (width, height)
+    intrinsics: Sequence[Number] | None = None  # fx, fy, cx, cy at `size`; None = .82 times the width and the centre
+    movers: int = 0  # how many things move, see `build_movers`
 
     name: ClassVar[str]
     classes: ClassVar[tuple[str, ...]]

@@ -23,19 +23,12 @@ SOURCE = "Replica as rendered for iMAP and NICE-SLAM, see the NICE-SLAM project 
 
 @dataclass(eq=False)
 class Replica(Straightened):
-    """One rendered sequence of Replica.
-
-    Args:
-        root: folder that holds cam_params.json and the scenes.
-        sequence: "office0".
-        intrinsics: of the images on disk, as `Images` takes them; None = those of cam_params.json.
-        depth_scale: raw units per metre; None = that of cam_params.json.
-    """
+    """One rendered sequence of Replica, such as "office0", below root, which has cam_params.json."""
 
     stride: int = 10
     size: Sequence[int] = (320, 180)
-    intrinsics: Given | None = None
-    depth_scale: Number | None = None
+    intrinsics: Given | None = None  # of the images on disk, as `Images` takes them; None = those of cam_params.json
+    depth_scale: Number | None = None  # raw units per metre; None = that of cam_params.json
 
     name, layout, source = "replica", LAYOUT, SOURCE
     has_ground_truth = True

@@ -31,19 +31,11 @@ RECTIFIED = re.compile(r"(^|[/_])rect([/_]|$)")  # a topic, as image_proc and ot
 
 @dataclass(eq=False)
 class RosBag(Straightened):
-    """The images of one topic.
+    """The images of one topic of the bag root or root/sequence, in the order in which they were taken."""
 
-    Args:
-        sequence: bag below root; None = root itself.
-        start, stop, stride: which of the images, in the order in which they were taken.
-        topic: of sensor_msgs/Image or CompressedImage; None = the only one.
-        info_topic: of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one.
-        intrinsics: as `Images` takes them; None = those of the first CameraInfo.
-    """
-
-    topic: str | None = None
-    info_topic: str | None = None
-    intrinsics: Given | None = None
+    topic: str | None = None  # of sensor_msgs/Image or CompressedImage; None = the only one
+    info_topic: str | None = None  # of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one
+    intrinsics: Given | None = None  # as `Images` takes them; None = those of the first CameraInfo
 
     name, layout, source = "rosbag", LAYOUT, "ros2 bag record"
 

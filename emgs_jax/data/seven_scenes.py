@@ -36,21 +36,15 @@ NEAR = 0.05  # metres; nothing the sensor measures is nearer
 
 @dataclass(eq=False)
 class SevenScenes(Straightened):
-    """One sequence of 7-Scenes.
-
-    Args:
-        sequence: "SCENE/seq-XX".
-        intrinsics: of the 640x480 colour images, as `Images` takes them; None = 525 when registered, else 585.
-        depth_scale: raw units per metre.
-        register_depth: warp depth into the colour camera and give its pose; else depth and pose are the depth camera's.
-        poses: file with the true poses, in place of the release's, see `read_poses`.
-    """
+    """One sequence of 7-Scenes, "SCENE/seq-XX"."""
 
     stride: int = 10
+    # of the 640x480 colour images, as `Images` takes them; None = 525 when registered, else 585
     intrinsics: Given | None = None
-    depth_scale: Number = 1000.0
+    depth_scale: Number = 1000.0  # raw units per metre
+    # warp depth into the colour camera and give its pose; else depth and pose are the depth camera's
     register_depth: bool = True
-    poses: str | None = None
+    poses: str | None = None  # file with the true poses, in place of the release's, see `read_poses`
 
     name, layout, source = "seven_scenes", LAYOUT, SOURCE
     has_ground_truth = True

@@ -21,19 +21,15 @@ class Straightened(Dataset):
 
     A subclass is a dataclass with its options. It calls `_find`, `_select` and `_use`, and sets `_folder` (which names
     of files are relative to in the fingerprint), `_images`, `_times` and what else is set below.
-
-    Args:
-        root: folder of the data set.
-        sequence: folder below root; where a subclass allows it, None = root itself.
-        start, stop, stride: which of the images that are there, in their order.
-        size: (width, height) of the frames given out; another aspect than the images' is allowed (fx and fy follow).
     """
 
-    root: str | None = None
-    sequence: str | None = None
+    root: str | None = None  # folder of the data set
+    sequence: str | None = None  # folder below root; where a subclass allows it, None = root itself
+    # start, stop, stride: which of the images that are there, in their order
     start: int = 0
     stop: int | None = None
     stride: int = 1
+    # (width, height) of the frames given out; another aspect than the images' is allowed (fx and fy follow)
     size: Sequence[int] = (320, 240)
 
     layout = source = ""  # for messages: what stands where, and where it comes from

@@ -40,22 +40,17 @@ CALIBRATIONS: Calibrations = {
 
 @dataclass(eq=False)
 class TumLayout(Straightened):
-    """One sequence in the TUM layout; without depth.txt or groundtruth.txt there is no ground truth.
+    """One sequence in the TUM layout, images of rgb.txt in order of time.
 
-    A colour image without depth near in time stays in use with depth 0 everywhere; one without a pose, or with one of
-    inf or nan, has none. A list that no image has anything of is an error.
-
-    Args:
-        start, stop, stride: which of the images in rgb.txt, in order of time.
-        intrinsics: of the images on disk, as `Images` takes them; None = the benchmark's calibration.
-        depth_scale: raw units per metre.
-        max_time_difference: seconds between a colour image and its depth image or pose.
+    Without depth.txt or groundtruth.txt there is no ground truth. A colour image without depth near in time stays in
+    use with depth 0 everywhere; one without a pose, or with one of inf or nan, has none. A list that no image has
+    anything of is an error.
     """
 
     stride: int = 10
-    intrinsics: Given | None = None
-    depth_scale: Number = 5000.0
-    max_time_difference: Number = 0.02
+    intrinsics: Given | None = None  # of the images on disk, as `Images` takes them; None = the benchmark's calibration
+    depth_scale: Number = 5000.0  # raw units per metre
+    max_time_difference: Number = 0.02  # seconds between a colour image and its depth image or pose
 
     layout = LAYOUT
     calibrations: ClassVar[Calibrations]
@@ -98,20 +93,14 @@ class TumLayout(Straightened):
 
 @dataclass(eq=False)
 class Tum(TumLayout):
-    """TUM RGB-D, and what has its layout, maybe with true classes.
+    """TUM RGB-D, where freiburg1, 2 and 3 in the sequence's name choose the calibration, and what has its layout."""
 
-    Args:
-        sequence: "rgbd_dataset_freiburg1_desk"; freiburg1, 2 and 3 in the name choose the calibration.
-        distortion: k1, k2, p1, p2, k3 that goes with four numbers of `intrinsics`; None = what those say themselves.
-        labels: folder in the sequence with the true classes of every image, see `LabelFolder`; None = there are none.
-        classes: file in the sequence that names them.
-        unknown: their ids that mean no class, see `LabelFolder`.
-    """
-
+    # k1, k2, p1, p2, k3 that goes with four numbers of `intrinsics`; None = what those say themselves
     distortion: Sequence[Number] | None = None
+    # folder in the sequence with the true classes of every image, see `LabelFolder`; None = there are none
     labels: str | None = None
-    classes: InitVar[str] = "classes.txt"
-    unknown: Sequence[int] | None = None
+    classes: InitVar[str] = "classes.txt"  # file in the sequence that names them
+    unknown: Sequence[int] | None = None  # their ids that mean no class, see `LabelFolder`
 
     name = "tum"
     source = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
