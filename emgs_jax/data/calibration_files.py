@@ -204,9 +204,7 @@ def _mast3r_slam(values: Mapping[str, Any], path: Path) -> Calibration:
     width, height = needed(values, ("width", "height"), path)
     numbers = numbers_of(values["calibration"], "calibration", path)
     if len(numbers) not in (4, 8, 9):
-        raise ValueError(
-            f"{path}: calibration must be fx, fy, cx, cy(, k1, k2, p1, p2(, k3)), got {len(numbers)}: correct it"
-        )
+        raise ValueError(f"{path}: calibration must be fx, fy, cx, cy(, k1, k2, p1, p2(, k3)), got {len(numbers)}")
     fx, fy, cx, cy, *bent = numbers
     return Calibration((fx, fy, cx, cy), lens_of("OPENCV", bent, path), size_of(width, height, path))
 

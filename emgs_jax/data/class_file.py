@@ -36,15 +36,14 @@ class ClassFile:
         found, inverse = np.unique(ids, return_inverse=True)
         unnamed = [int(number) for number in found if int(number) not in self.positions]
         cut = {number: [n for n in (number - 256, number + 256) if n in self.positions] for number in unnamed}
+        nameless = f"{what}: no name in {self.path} for {_some(unnamed)}"
         if unnamed and all(cut.values()):
             raise ValueError(
-                f"{what}: no name in {self.path} for {_some(unnamed)}, but for {_some([n[0] for n in cut.values()])}: "
-                "ids of 16 bits were read or written as 8 bits; export them again with 16 bits or as text"
+                f"{nameless}, but for {_some([n[0] for n in cut.values()])}: ids of 16 bits were read or written as 8 "
+                "bits; export them again with 16 bits or as text"
             )
         if unnamed:
-            raise ValueError(
-                f"{what}: no name in {self.path} for {_some(unnamed)}: give the class file of this data set"
-            )
+            raise ValueError(f"{nameless}: give the class file of this data set")
         return np.array([self.positions[int(number)] for number in found], np.int64)[inverse.reshape(np.shape(ids))]
 
 

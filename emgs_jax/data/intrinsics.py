@@ -164,9 +164,7 @@ def from_exif(pictures: Pictures) -> Calibration:
         )
     if len(found) > 1:
         each = ", ".join(f"{value:g} mm in {path.name}" for value, path in found.items())
-        raise ValueError(
-            f"dataset.intrinsics=exif: the images were taken with several focal lengths ({each}): take those of one"
-        )
+        raise ValueError(f"dataset.intrinsics=exif: there are several focal lengths ({each}): take those of one")
     (millimetres,) = found
     (w, h) = pictures.size
     focal = millimetres / DIAGONAL_35_MM * math.hypot(w, h)

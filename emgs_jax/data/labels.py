@@ -60,9 +60,7 @@ class LabelFolder:
             )
         reading.check_raw_size(ids, raw_size, path)
         if ids.dtype == np.uint8 and self._largest_id > 255:
-            raise BadFrameError(
-                f"{path} has 8 bits, but {self.classes} has ids up to {self._largest_id}: write it with 16 bits"
-            )
+            raise BadFrameError(f"{path} has 8 bits, {self.classes} ids to {self._largest_id}: write it with 16 bits")
         try:
             return self._known.positions_of(ids, path).astype(np.int32)
         except ValueError as error:

@@ -60,9 +60,7 @@ def select(count: int, start: int, stop: int | None, stride: int, where: object)
     if not 0 <= start < count:
         raise ValueError(f"dataset.start must be in 0..{count - 1}, {where} has {count} images; got {start}")
     if stop is not None and not start < stop <= count:
-        raise ValueError(
-            f"dataset.stop must be null (all) or in {start + 1}..{count}, {where} has {count} images; got {stop}"
-        )
+        raise ValueError(f"dataset.stop must be null (all) or in {start + 1}..{count}, of {where}; got {stop}")
     return range(start, count if stop is None else stop, stride)
 
 
@@ -352,9 +350,7 @@ def as_pose(text: str, where: object, may_be_far: bool = False) -> Float[np.ndar
                 "columns by it, and give depth and positions in one unit"
             )
         if scale < 0 and is_rigid(pose * np.where(np.arange(4) == 0, -1.0, 1.0)):
-            raise BadFrameError(
-                f"{where} has a mirrored pose, as where one axis was flipped: flip two of them, or none"
-            )
+            raise BadFrameError(f"{where} has a mirrored pose, as of one axis flipped: flip two of them, or none")
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded

@@ -222,7 +222,5 @@ def find_calibration(
     if len(bent) != 5 or not np.isfinite(bent).all():
         raise ValueError(f"dataset.distortion must be [k1, k2, p1, p2, k3], got {list(distortion)}")
     if isinstance(intrinsics, str) or len(intrinsics) != 4:
-        raise ValueError(
-            "dataset.distortion goes with dataset.intrinsics=[fx,fy,cx,cy] only: put it behind them or into the file"
-        )
+        raise ValueError("dataset.distortion goes with dataset.intrinsics=[fx,fy,cx,cy] only: put it behind them")
     return (*intrinsics, *bent)

@@ -24,13 +24,8 @@ def poses(walk: str, seed: int = 0) -> np.ndarray:
     return np.array([dataset.pose(index) for index in range(len(dataset))])
 
 
-@cache
 def surfaces(seed: int) -> o3d.t.geometry.RaycastingScene:
-    scene = o3d.t.geometry.RaycastingScene()
-    for _, mesh in apartment(seed=seed).parts:
-        vertices, faces = np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.uint32)
-        scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
-    return scene
+    return apartment(seed=seed)._scene
 
 
 def rooms(plan: Plan) -> tuple[Area, ...]:

@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 from PIL import ExifTags, Image
+from written_scene import center_of_dot, dots
 
 from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.images import Images
@@ -19,19 +20,6 @@ LENSES = {"barrel": (-0.25, 0.05, 0.002, -0.001), "pincushion": (0.15, 0.02, -0.
 FOLDED = (-9, 0, 0, 0), (0, 0, 2, 0), (0, -80, 0, 0)
 DOT = np.array([[30.0, 25.0], [80.0, 60.0], [131.0, 96.0]])
 TUM = "rgbd_dataset_freiburg3_plane"
-
-
-def dots() -> np.ndarray:
-    """Soft white dots at DOT."""
-    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
-    spots = sum(np.exp(-((u - x) ** 2 + (v - y) ** 2) / 8) for x, y in DOT)
-    return np.repeat(np.rint(255 * np.minimum(spots, 1))[..., None], 3, axis=-1).astype(np.uint8)
-
-
-def center_of_dot(image, near) -> np.ndarray:
-    u, v = np.meshgrid(np.arange(image.shape[1]), np.arange(image.shape[0]))
-    weight = image[..., 0] * ((u - near[0]) ** 2 + (v - near[1]) ** 2 < 100.0)
-    return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
 
 
 def straight_pixels(pixels, intrinsics, lens, new):
@@ -49,7 +37,7 @@ def write_photo(path, **exif) -> None:
             tags[ExifTags.Base.Orientation] = value
         else:
             tags.get_ifd(ExifTags.IFD.Exif)[ExifTags.Base[name]] = value
-    Image.fromarray(dots()).save(path, exif=tags, quality=95)
+    Image.fromarray(dots(DOT, SIZE)).save(path, exif=tags, quality=95)
 
 
 def folder_of(tmp_path, **exif):

@@ -1,7 +1,5 @@
 """7-Scenes: registration, poses of the colour camera, layout."""
 
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -100,23 +98,6 @@ def test_a_frame_whose_tracking_was_lost_or_whose_pose_is_not_there_has_no_truth
         path.unlink()
     with pytest.raises(ValueError, match="0 of 3 images have a true pose"):
         ReadableFrames(load(seven_scenes_root))
-
-
-def test_poses_are_the_published_poses_of_the_colour_camera(shared_data):
-    root = shared_data("7scenes")
-    published = {}
-    for line in Path(root, "redkitchen/seq-01_color_camera_poses_dslam.txt").read_text().splitlines():
-        if not line.startswith("#"):
-            name, *numbers = line.split()
-            w, x, y, z, *t = (float(n) for n in numbers[:7])
-            world_to_camera = Rotation.from_quat([x, y, z, w])
-            published[int(name[-16:-10])] = -world_to_camera.inv().apply(t), world_to_camera.inv()
-    dataset = SevenScenes(root, REAL, stride=50)
-    assert len(dataset) == 5
-    for frame in dataset:
-        center, rotation = published[int(frame.timestamp)]
-        assert np.linalg.norm(frame.T_world_camera[:3, 3] - center) < 2e-4  # six digits; the depth camera is 2.5 cm off
-        assert (Rotation.from_matrix(frame.T_world_camera[:3, :3]).inv() * rotation).magnitude() < 2e-4
 
 
 def write_poses(path, poses, sequence="seq-01"):
