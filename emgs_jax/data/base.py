@@ -51,9 +51,8 @@ class Dataset(Protocol):
     sequence: str  # e.g. "redkitchen/seq-01"
     size: tuple[int, int]  # (width, height) of every frame
     intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels at `size`, pixel centres at integers
-    calibration: Mapping[str, Any] = MappingProxyType(
-        {}
-    )  # where `intrinsics` are from, plain values for metrics.json; `note` if worth a line
+    # where `intrinsics` are from, plain values for metrics.json; `note` if worth a line
+    calibration: Mapping[str, Any] = MappingProxyType({})
     full_intrinsics: tuple[float, float, float, float] | None = None  # of `full`; None where it is the frame's image
     classes: tuple[str, ...] = ()  # names of the labels; empty without semantics
     has_ground_truth: bool = False  # depth and poses are there

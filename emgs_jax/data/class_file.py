@@ -72,13 +72,13 @@ def read_classes(path: str | os.PathLike) -> ClassFile:
 
 def _of_yaml(text: str) -> tuple[list[str], dict[int, int]]:
     content = yaml.safe_load(text)
-    missing = [key for key in ("class_names_reduced", "map_to_reduced") if key not in _mapping(content, "it")]
+    missing = [key for key in ("class_names_reduced", "map_to_reduced") if key not in _checked(Mapping, content, "it")]
     if missing:
         raise ValueError(f"it lacks {', '.join(missing)}")
-    names = [_word(name) for name in _list(content["class_names_reduced"])]
+    names = [_word(name) for name in _checked(list, content["class_names_reduced"], "class_names_reduced")]
     # OVO leaves out points of classes that the scenes do not have; what has not even a name is an error.
-    positions = {number: -1 for number, _ in enumerate(_list(content.get("class_names") or []))}
-    for number, position in _mapping(content["map_to_reduced"], "map_to_reduced").items():
+    positions = {number: -1 for number, _ in enumerate(_checked(list, content.get("class_names") or [], "class_names"))}
+    for number, position in _checked(Mapping, content["map_to_reduced"], "map_to_reduced").items():
         if not isinstance(number, int) or not isinstance(position, int) or not 0 <= position <= len(names):
             raise ValueError(f"map_to_reduced says {number!r}: {position!r}, and there are {len(names)} classes")
         positions[number] = position if position < len(names) else -1
@@ -99,15 +99,9 @@ def _of_lines(text: str) -> tuple[list[str], dict[int, int] | None]:
     return [_word(row[2]) for row in rows if row], {0: -1} | positions
 
 
-def _mapping(value: Any, what: str) -> Mapping[Any, Any]:
-    if not isinstance(value, Mapping):
-        raise ValueError(f"{what} is no mapping")
-    return value
-
-
-def _list(value: Any) -> list[Any]:
-    if not isinstance(value, list):
-        raise ValueError(f"expected a list, got {type(value).__name__}")
+def _checked(kind: type, value: Any, what: str) -> Any:
+    if not isinstance(value, kind):
+        raise ValueError(f"{what} is no {kind.__name__.lower()}")
     return value
 
 
