@@ -34,9 +34,7 @@ def furnish(
         for _ in range(TRIES):
             placed = at_wall(piece, area, int(rng.choice(area.walls)), rng.uniform())
             box = bounds(placed)
-            is_inside = (box[0, :2] > np.array(area.low) - 1e-6).all() and (
-                box[1, :2] < np.array(area.high) + 1e-6
-            ).all()
+            is_inside = (box[0, :2] > low).all() and (box[1, :2] < high).all()
             if is_inside and not _meets(box, taken, GAP).any() and _distance(lanes, box) > LANE:
                 parts, taken = parts + placed, [*taken, box]
                 break
