@@ -162,35 +162,23 @@ def _pose(values: Sequence[float], place: str) -> np.ndarray:
 def check_whole(folder: Path) -> None:
     """Check that the binary files of a model do not end too soon, which is a ValueError: pycolmap would not end."""
     for path in sorted(folder.glob("*.bin")):
-        if skip := _SKIP.get(path.stem):
-            for record in _Records(path):
-                skip(record)
+        if path.stem in _CHECKED:
+            _CHECKED[path.stem](path)
 
 
-def _skip_camera(record: _Records) -> None:
-    _, number, _, _ = record.values("IiQQ")
-    known = [*MODELS.values()]
-    record.skip(8 * len(known[number].split()) if 0 <= number < len(known) else -1)
+def _check_rigs(path: Path) -> None:
+    for record in _Records(path):
+        _, count = record.values("II")
+        for number in range(count):
+            record.values("iI")
+            if number and record.values("?")[0]:
+                record.values("7d")
 
 
-def _skip_image(record: _Records) -> None:
-    record.values("I7dI")
-    record.text()
-    record.skip(POINT_SIZE * record.values("Q")[0])
-
-
-def _skip_rig(record: _Records) -> None:
-    _, count = record.values("II")
-    for number in range(count):
-        record.values("iI")
-        if number and record.values("?")[0]:
-            record.values("7d")
-
-
-_SKIP: dict[str, Callable[[_Records], object]] = {
-    "cameras": _skip_camera,
-    "images": _skip_image,
-    "points3D": lambda record: record.skip(8 * record.values("43xQ")[0]),
-    "rigs": _skip_rig,
-    "frames": lambda record: record.skip(16 * record.values("II7dI")[-1]),
+_CHECKED: dict[str, Callable[[Path], object]] = {
+    "cameras": _binary_cameras,
+    "images": _binary_images,
+    "points3D": lambda path: [record.skip(8 * record.values("43xQ")[0]) for record in _Records(path)],
+    "rigs": _check_rigs,
+    "frames": lambda path: [record.skip(16 * record.values("II7dI")[-1]) for record in _Records(path)],
 }
