@@ -152,7 +152,10 @@ def register(depth: Float32[np.ndarray, "_ _"], intrinsics: Intrinsics, size: Si
     Every source pixel is a square that covers the target pixels whose centres lie in it; the nearest surface wins, and
     of that the mean inverse depth: the nearest square alone is before a slanted surface.
     """
-    points = color_camera_points(depth)
+    points = backproject(depth, DEPTH_INTRINSICS)[depth > NEAR]
+    # einsum, as a threaded matmul of this shape waits for its threads when the machine is busy
+    points = np.einsum("pj,ij->pi", points, T_COLOR_DEPTH[:3, :3]) + T_COLOR_DEPTH[:3, 3]
+    points = points[points[:, 2] > NEAR]  # in the colour camera's axes
     (fx, fy, cx, cy), (w, h) = intrinsics, size
     u, v, z = fx * points[:, 0] / points[:, 2] + cx, fy * points[:, 1] / points[:, 2] + cy, points[:, 2]
     half_u, half_v = (0.5 * FOOTPRINT_MARGIN * f / g for f, g in zip((fx, fy), DEPTH_INTRINSICS[:2], strict=True))
@@ -170,11 +173,3 @@ def register(depth: Float32[np.ndarray, "_ _"], intrinsics: Intrinsics, size: Si
     pixels, inverse = pixels[is_front], 1.0 / depths[is_front]
     count, total = np.bincount(pixels, minlength=h * w), np.bincount(pixels, inverse, minlength=h * w)
     return np.where(count > 0, count / np.where(count > 0, total, 1.0), 0.0).astype(np.float32).reshape(h, w)
-
-
-def color_camera_points(depth: Float32[np.ndarray, "h w"]) -> Float[np.ndarray, "p 3"]:
-    """Points of the valid pixels of the depth camera in the colour camera's axes, metres."""
-    points = backproject(depth, DEPTH_INTRINSICS)[depth > NEAR]
-    # einsum, as a threaded matmul of this shape waits for its threads when the machine is busy
-    points = np.einsum("pj,ij->pi", points, T_COLOR_DEPTH[:3, :3]) + T_COLOR_DEPTH[:3, 3]
-    return points[points[:, 2] > NEAR]
