@@ -2,13 +2,13 @@
 
 Such a file is an archive: a pickle of what was saved, and a member for every storage. Before version 1.6 it was five
 pickles (magic number, version, the machine, what was saved, names of storages) and then every storage: its number of
-elements and its bytes.
+elements and its bytes. The instructions of what was saved are followed only as far as they make dictionaries, lists and
+numbers, and describe tensors; what else a pickle could ask for is refused.
 """
 
 import math
-import pickle
+import pickletools
 import zlib
-from collections import OrderedDict
 from collections.abc import Mapping
 from io import BytesIO
 from typing import Any, NamedTuple
@@ -17,34 +17,17 @@ from zipfile import BadZipFile, ZipFile
 import numpy as np
 
 MAGIC = 0x1950A86A20F9469CFC6C
+DTYPES = {"torch FloatStorage": "<f4", "torch LongStorage": "<i8"}
 DAMAGED = (LookupError, TypeError, AttributeError, UnicodeDecodeError, RuntimeError, OverflowError)
-DAMAGED += (BadZipFile, EOFError, zlib.error, pickle.UnpicklingError)
+DAMAGED += (BadZipFile, EOFError, zlib.error)
+_MARK = object()
 
 
 class _Tensor(NamedTuple):
-    storage: tuple  # ("storage", dtype, name, device, number of elements, …)
+    storage: tuple  # ("storage", class, name, device, number of elements, …)
     offset: int
     shape: tuple[int, ...]
     strides: tuple[int, ...]  # elements
-
-
-class _Plain(pickle.Unpickler):
-    """Makes dictionaries, lists and numbers, and describes tensors; what else a pickle could ask for is refused."""
-
-    KNOWN = {
-        "collections OrderedDict": OrderedDict,
-        "torch._utils _rebuild_tensor_v2": lambda *described: _Tensor(*described[:4]),
-        "torch FloatStorage": "<f4",
-        "torch LongStorage": "<i8",
-    }
-
-    def find_class(self, module: str, name: str) -> Any:
-        if f"{module} {name}" not in self.KNOWN:
-            raise ValueError(f"has more than tensors ({module} {name})")
-        return self.KNOWN[f"{module} {name}"]
-
-    def persistent_load(self, pid: Any) -> Any:
-        return pid
 
 
 def read_tensors(content: bytes, key: str | None) -> dict[str, np.ndarray]:
@@ -65,7 +48,7 @@ def _from_archive(stream: BytesIO) -> tuple[Any, dict[str, np.ndarray]]:
     """What was saved, and its storages by name."""
     with ZipFile(stream) as archive:
         first = [name for name in archive.namelist() if name.endswith("/data.pkl")][0]
-        saved = _Plain(BytesIO(archive.read(first))).load()
+        saved = _value(BytesIO(archive.read(first)))
         folder = first.removesuffix(".pkl")
         known = {tensor.storage[2]: tensor.storage for tensor in _tensors(saved)}
         return saved, {name: _numbers(archive.read(f"{folder}/{name}"), known[name]) for name in known}
@@ -73,20 +56,20 @@ def _from_archive(stream: BytesIO) -> tuple[Any, dict[str, np.ndarray]]:
 
 def _from_stream(stream: BytesIO) -> tuple[Any, dict[str, np.ndarray]]:
     """Likewise of a file before version 1.6."""
-    if _Plain(stream).load() != MAGIC:
+    if _value(stream) != MAGIC:
         raise ValueError("not of torch.save")
-    _, _, saved, names = (_Plain(stream).load() for _ in range(4))
+    _, _, saved, names = (_value(stream) for _ in range(4))
     known = {tensor.storage[2]: tensor.storage for tensor in _tensors(saved)}
     return saved, {name: _storage(stream, known[name]) for name in names}
 
 
 def _numbers(content: bytes, described: tuple) -> np.ndarray:
-    return np.frombuffer(content, np.dtype(described[1]), described[4])
+    return np.frombuffer(content, np.dtype(DTYPES[described[1]]), described[4])
 
 
 def _storage(stream: BytesIO, described: tuple) -> np.ndarray:
     """The next storage of the stream."""
-    dtype, count = np.dtype(described[1]), described[4]
+    dtype, count = np.dtype(DTYPES[described[1]]), described[4]
     if int.from_bytes(stream.read(8), "little") != count:
         raise ValueError("a storage has another number of elements than its tensor says")
     return _numbers(stream.read(count * dtype.itemsize), described)
@@ -106,3 +89,62 @@ def _tensors(value: Any) -> list[_Tensor]:
         return [value]
     inner = value.values() if isinstance(value, dict) else value if isinstance(value, list) else ()
     return [tensor for item in inner for tensor in _tensors(item)]
+
+
+def _value(stream: BytesIO) -> Any:
+    """The value of the next pickle of a stream, of plain data and tensors."""
+    stack: list[Any] = []
+    memo: dict[int, Any] = {}
+
+    def since_mark() -> list:
+        start = len(stack) - 1 - stack[::-1].index(_MARK)
+        items = stack[start + 1 :]
+        del stack[start:]
+        return items
+
+    for code, argument, _ in pickletools.genops(stream):
+        match code.name:
+            case "PROTO" | "STOP":
+                pass
+            case "MARK":
+                stack.append(_MARK)
+            case "BINPUT" | "LONG_BINPUT":
+                memo[argument] = stack[-1]
+            case "BINGET" | "LONG_BINGET":
+                stack.append(memo[argument])
+            case "BINUNICODE" | "BININT" | "BININT1" | "BININT2" | "LONG1" | "BINFLOAT" | "GLOBAL":
+                stack.append(argument)
+            case "NONE" | "NEWTRUE" | "NEWFALSE":
+                stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[code.name])
+            case "EMPTY_DICT" | "EMPTY_LIST" | "EMPTY_TUPLE":
+                stack.append({"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple}[code.name]())
+            case "TUPLE":
+                stack.append(tuple(since_mark()))
+            case "TUPLE1" | "TUPLE2" | "TUPLE3":
+                count = int(code.name[-1])
+                stack[-count:] = [tuple(stack[-count:])]
+            case "SETITEMS" | "SETITEM":
+                items = since_mark() if code.name == "SETITEMS" else [stack.pop(-2), stack.pop()]
+                stack[-1].update(zip(items[::2], items[1::2], strict=True))
+            case "APPENDS" | "APPEND":
+                items = since_mark() if code.name == "APPENDS" else [stack.pop()]
+                stack[-1].extend(items)
+            case "BINPERSID":
+                pass  # a storage: the tuple that describes it
+            case "BUILD":
+                stack.pop()  # versions of layers, beside the dictionary of their tensors
+            case "REDUCE":
+                arguments, name = stack.pop(), stack.pop()
+                stack.append(_made(name, arguments))
+            case _:
+                raise ValueError(f"has more than tensors ({code.name})")
+    return stack[-1]
+
+
+def _made(name: str, arguments: tuple) -> Any:
+    """Stand-in for what a function that is named in the file would make."""
+    if name == "collections OrderedDict" and not arguments:
+        return {}
+    if name == "torch._utils _rebuild_tensor_v2":
+        return _Tensor(*arguments[:4])
+    raise ValueError(f"has more than tensors ({name})")
