@@ -210,7 +210,7 @@ def _unit(vectors: Float32[np.ndarray, "*b d"]) -> Float32[np.ndarray, "*b d"]:
 
 
 def propose_candidates(database: Database, row: int, config: PlaceRecognitionConfig) -> list[int]:
-    """Propose loop candidates (rows): earlier keyframes as similar as the query's own last neighbours or more, best first.
+    """Propose loop candidates (rows): earlier keyframes as similar as the last neighbours or more, best first.
 
     At least `min_gap` frames older, the best only within `suppressed_gap` frames, `num_candidates` at most; none for
     the first keyframe. The threshold is a quantile of the similarity to neighbours (LoopSplat, ViSTA-SLAM).
