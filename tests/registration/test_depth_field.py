@@ -28,9 +28,15 @@ def rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
 
 
-def test_a_smooth_field_is_found_in_noise() -> None:
+@pytest.mark.parametrize(("errors", "noise"), [(NOISE, 0.01), (0.0, 0.0)])
+def test_a_smooth_field_is_found_in_noise(errors, noise: float) -> None:
     assert rms(TRUE) > 0.03
-    assert rms(found(TRUE + NOISE) - TRUE) < 0.006
+    assert rms(found(TRUE + errors, noise) - TRUE) < 0.006
+
+
+def test_where_nothing_differs_and_nothing_may_there_is_no_field() -> None:
+    """`icp.noise=0` with an exact prior: 0 / 0 was the field, and with it all points of a tracked frame."""
+    assert not found(0.0, noise=0.0).any()
 
 
 def test_noise_that_is_not_alike_is_no_field() -> None:
