@@ -137,7 +137,7 @@ def test_where_nothing_determines_a_rotation_it_has_no_slope(weight):
     same = np.ones((20, 3), np.float32)
 
     def total(source):
-        T, scale = rigid.fit_rigid(source, same, jnp.full(20, np.float32(weight)))
+        T, scale = rigid.fit_rigid(source, jnp.asarray(same), jnp.full(20, np.float32(weight)))
         return jnp.sum(T.rotation().wxyz) + scale
 
     assert not on_host(jax.grad(total))(same).any()
