@@ -315,7 +315,7 @@ def test_a_number_that_is_none_leaves_its_pixel_out_and_no_other(camera, config,
 
 
 def test_a_pose_whose_quaternion_is_none_is_unknown_and_one_that_is_too_long_or_short_is_made_a_unit():
-    """Of a matrix that is rigid to three decimals: each frame multiplied the length of all poses after it by its own."""
+    """Of a matrix rigid to three decimals: each frame multiplied the length of all poses after it by its own."""
     values = np.float32([[1, 0, 0, 0, 1, 2, 3], [0, 0, 0, 0, 1, 2, 3], [1, 0, 0, 0, 1e30, 2, 3], [np.nan] * 7])
     turned = np.float32([0.1, 0.5, 0.7, 0.5, 1, 2, 3])
     values = np.concatenate([values, [turned * [f, f, f, f, 1, 1, 1] for f in (0.97, 1.0, 1.03)]]).astype(np.float32)
