@@ -6,8 +6,8 @@ from omegaconf import DictConfig
 
 from emgs_jax.config.overrides import KEY, quoted
 from emgs_jax.io.files import check_writable
+from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.page import write_report
-from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.run_images import images_of
 
 from .command import command
