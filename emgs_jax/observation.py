@@ -177,8 +177,8 @@ def sound_poses(poses: jaxlie.SE3) -> jaxlie.SE3:
     off = jnp.abs(length_sq - 1.0)
     is_sound = (off < 0.1) & is_within_reach(translation)
     length = jnp.sqrt(jnp.where(is_sound & (off > ROUNDED_SQUARE), length_sq, 1.0))
-    poses = jnp.concatenate([quaternion / length[..., None], translation], axis=-1)
-    return jaxlie.SE3(jnp.where(is_sound[..., None], poses, jnp.nan))
+    values = jnp.concatenate([quaternion / length[..., None], translation], axis=-1)
+    return jaxlie.SE3(jnp.where(is_sound[..., None], values, jnp.nan))
 
 
 def sound_covariances(covariances: Float[Array, "*b 6 6"]) -> Float[Array, "*b 6 6"]:
