@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from g2o_reader import load_graph_g2o
 from omegaconf import OmegaConf
 from scene import assert_same, random_gaussians, random_observation
 
 from emgs_jax import back_end, load_config
 from emgs_jax.back_end.factors import FrameData, map_factor, sequential_factor, stack_factors
-from emgs_jax.back_end.g2o import save_graph_g2o
 from emgs_jax.back_end.loops import (
     consistent_loops,
     is_closure_due,
@@ -305,19 +303,6 @@ def test_without_a_loop_nothing_moves_however_the_predictions_differ(graph):
         end = add_node(end, look(ring(), index), pose, 1.0, max(index - 3, 0))
     state = state_of(placed)
     assert_same(close_loops(end, state)[1].map, state.map)
-
-
-def test_other_solvers_read_the_graph_in_the_scale_of_the_map(graph, tmp_path):
-    poses = ring()
-    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
-    for index, pose in enumerate(poses):
-        end = add_node(end, look(poses, index), pose, 1.1, None)
-    save_graph_g2o(tmp_path / "graph.g2o", metric_graph(end))
-    read = load_graph_g2o(tmp_path / "graph.g2o")
-    assert int(read.nodes.valid.sum()) == COUNT and len(read.factors.a) == len(end.factors)
-    np.testing.assert_allclose(
-        read.factors.Z_a_b.translation()[0], 1.1 * end.factors[0].Z_a_b[:3, 3], rtol=1e-5, atol=1e-6
-    )
 
 
 def test_a_graph_for_other_solvers_costs_what_ours_does_and_has_the_nodes_of_the_map_only(graph):

@@ -71,13 +71,6 @@ def test_a_map_that_moved_is_one_that_can_be_loaded(map, before, tmp_path):
     sc.assert_same(load_map(tmp_path / "map.npz"), new)
 
 
-def test_there_and_back_is_where_it_was(map, before):
-    after = nodes([sc.path_pose(i + 4) for i in range(3)], (0.1, -0.2, 0.05))
-    back = moved_map(moved_map(map, before, after, FLOOR, ALONE), after, before, FLOOR, ALONE)
-    for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(map), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-5)
-
-
 def test_what_a_camera_saw_at_a_pixel_stays_there_and_is_larger_by_the_scale(map, before):
     """A scale that acts before the new pose; about the world's origin it would move every pixel."""
     after = nodes([sc.path_pose(i + 4) for i in range(3)], (0.1, -0.2, 0.05))
