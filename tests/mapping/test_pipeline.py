@@ -172,14 +172,6 @@ def test_a_sequence_without_frames_is_refused():
         list(window_inputs(empty, Echo(), hydra.utils.instantiate(compose().slam), Clock()))
 
 
-def test_features_without_a_grid_for_each_dense_view_are_refused():
-    def edit(prediction):
-        return replace(prediction, features=prediction.features[0])
-
-    with pytest.raises(ValueError, match=r"features have shape \(48, 64, 16\) at frame 2, expected \(3, rows, columns"):
-        map_tiny(dataset(), EditedPrior(edit))
-
-
 @pytest.mark.slow
 def test_the_merged_initialization_makes_the_map_from_the_whole_window(monkeypatch):
     """Only the first window: `initialization` is static, so a step would be compiled anew."""
