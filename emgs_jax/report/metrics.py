@@ -210,7 +210,7 @@ def describe(run: MappingRun, dataset: ReadableFrames | None = None) -> Metrics:
         if len(known) >= 3:
             errors = trajectory_metrics(*map(np.stack, zip(*known, strict=True)))
             metrics[f"submaps/{number}/ate_sim3_m"] = errors["trajectory/ate_sim3_m"]
-    metrics["segments/unjoined_frames"] = sum(record.reason == UNJOINED for record in run.records)
+    metrics["submaps/unjoined_frames"] = sum(record.reason == UNJOINED for record in run.records)
     row = longest_row(run.records)
     metrics["frames/longest_untracked"] = len(row)
     start = run.records[row[0]].index if row else None

@@ -110,7 +110,7 @@ def test_outer_is_what_it_says():
 
 
 def test_a_tangent_basis_is_orthonormal_for_every_normal_poles_included():
-    normals = np.concatenate([RNG.normal(size=(200, 3)), np.eye(3), -np.eye(3), [[1e-4, 0, -1]]])
+    normals = np.concatenate([RNG.normal(size=(200, 3)), np.eye(3), -np.eye(3), [[1e-4, 0, -1], [1e-3, 0, 1]]])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     basis = tangent_basis(np.float32(normals))
     frame = np.concatenate([basis, normals[..., None]], axis=-1)
@@ -146,6 +146,6 @@ def test_whitening_keeps_all_that_a_flat_covariance_says(ratio):
 
 
 def test_a_covariance_flatter_than_float32_holds_is_flat_and_not_the_identity():
-    covs = np.float32(spd(500, 3, (1.0, 0.7, 1e-5)))
-    triangle = whitening(0.5 * (covs + covs.mT))[0]
+    covs = np.concatenate([spd(500, 3, (1.0, 0.7, 1e-5)), [np.diag(np.roll([1.0, 0.7, 0.0], i)) for i in range(3)]])
+    triangle = whitening(np.float32(0.5 * (covs + covs.mT)))[0]
     assert (triangle[:, [0, 2, 5]].max(axis=1) > 100).all()  # the last axis may lie nearly in the surface
