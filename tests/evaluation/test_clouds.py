@@ -163,7 +163,8 @@ def test_a_file_without_usable_points_is_named(tmp_path):
         ((0, 1, 2 * MAX_LENGTH_M), r"a\.ply has a point 2e\+\d+ m away"),
         ((), r"a\.ply has no points"),
     ):
-        points = np.array(x, np.float32)[:, None] * np.float32([1, 0, 0])
+        points = np.zeros((len(x), 3), np.float32)
+        points[:, 0] = x
         write_ply(tmp_path / "a.ply", structured(points, ["x", "y", "z"]))
         with pytest.raises(ValueError, match=message):
             read_cloud(tmp_path / "a.ply", 12)
