@@ -348,6 +348,7 @@ POISON = {
     "confidence": ("confidence", np.inf),
     "point": ("points", np.nan),
     "point beyond any map": ("points", 1e18),
+    "noise": ("noise", np.inf),
 }
 
 
@@ -355,11 +356,12 @@ POISON = {
 def test_a_point_with_a_number_that_is_none_is_left_out(paper, what):
     """One colour of 80 that was NaN made those of 36 of 40 Gaussians NaN."""
     name, value = POISON[what]
-    values = np.array(getattr(POINTS, name))
-    values[7] = value
+    values = np.array(getattr(POINTS, name, NOISE))
+    values.reshape(M, -1)[7, -1] = value
+    points, noise = (POINTS, values) if name == "noise" else (sc.replace(POINTS, **{name: values}), NOISE)
     config = sc.changed(paper, min_normal_cos=0.85, max_mahalanobis_sq=60.0)
     expected = em(MAP, sc.replace(POINTS, valid=np.arange(M) != 7), NOISE, config)
-    sc.assert_same(em(MAP, sc.replace(POINTS, **{name: values}), NOISE, config), expected)
+    sc.assert_same(em(MAP, points, noise, config), expected)
 
 
 def test_where_a_gaussian_has_a_vanishing_share_its_support_has_finite_slopes(paper):

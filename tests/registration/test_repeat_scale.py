@@ -85,3 +85,12 @@ def test_what_two_equal_predictions_differ_by_has_finite_slopes():
         return sum(repeat_error(before, same, pose(), jnp.ones(()), jnp.ones(())))
 
     assert np.isfinite(on_host(jax.grad(total))(before.points)).all()
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.0, float(np.sort(np.asarray(NOW.points)[:, 2])[639])), (0.0, 1.0)])
+def test_the_mean_depth_is_the_median_of_the_points_before_the_camera(factor, expected):
+    """Where all points were at the camera, depths were a part of 0 and the whole state NaN."""
+    depths = factor * np.asarray(NOW.points)
+    now, before = replace(NOW, points=depths), moved_points(T, NOW)
+    _, depth = on_host(repeat_error)(now, before, T, device(1.0), device(1.0))
+    assert depth == pytest.approx(expected)
