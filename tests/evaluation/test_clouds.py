@@ -9,8 +9,6 @@ from emgs_jax.evaluation.clouds import (
     NearestPoints,
     PointCloud,
     SpooledCloud,
-    cell_centers,
-    cell_numbers,
     coarse_points,
     read_cloud,
     register,
@@ -37,14 +35,6 @@ def test_points_of_a_voxel_become_their_means_and_twice_is_once():
     for name, values in (("points", points), ("normals", expected), ("colors", colors)):
         np.testing.assert_allclose(getattr(small, name), values, rtol=0, atol=1e-12)
         np.testing.assert_allclose(getattr(again, name), getattr(small, name), atol=1e-12)
-
-
-def test_the_centre_of_a_points_cell_is_within_half_a_voxel_of_it():
-    points = np.random.default_rng(10).uniform(-50, 50, (1000, 3))
-    numbers = cell_numbers(points, 0.25)
-    centers = cell_centers(numbers, 0.25)
-    assert np.abs(centers - points).max() <= 0.125 + 1e-12
-    np.testing.assert_array_equal(cell_numbers(centers, 0.25), numbers)
 
 
 def test_of_few_points_all_are_the_nearest_and_of_none_there_are_none():

@@ -42,6 +42,7 @@ def test_without_loops_or_returns_or_truth_nothing_is_said():
         "loops/returning_frames": 11,
     }
     assert loop_metrics([], THERE_AND_BACK, 90)["loops/recall"] is None
+    assert loop_metrics([], THERE_AND_BACK, 80)["loops/returning_frames"] == 1, "the last, 80 frames after the first"
     unknown = [None] * len(THERE_AND_BACK)
     assert loop_metrics([between(5, 75, THERE_AND_BACK)], unknown, 60)["loops/precision"] is None
 

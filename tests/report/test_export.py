@@ -14,9 +14,7 @@ from written_run import INTRINSICS, SIZE, written_run
 
 from emgs_jax.config import configure
 from emgs_jax.data.calibration_files import read_calibration
-from emgs_jax.data.colmap_model import load_colmap
-from emgs_jax.data.transforms_json import load_transforms
-from emgs_jax.io.cameras import save_colmap, save_frustums
+from emgs_jax.io.cameras import save_frustums
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.camera import Camera
@@ -131,16 +129,6 @@ def test_transforms_look_along_minus_z_with_y_up_and_keep_the_unit(written):
     found = read_calibration(folder / "transforms.json")  # our reader of other programs' files
     np.testing.assert_allclose(found.intrinsics, INTRINSICS, rtol=1e-6)
     assert found.size == SIZE and found.distortion == ()
-
-
-def test_what_we_write_we_read(written, tmp_path):
-    model = load_colmap(written.folder / "colmap" / "sparse" / "0")
-    np.testing.assert_allclose(model.T_world_camera, tracked(written), atol=1e-12)
-    _, rows = load_transforms(written.folder / "nerfstudio" / "transforms.json")
-    np.testing.assert_allclose(np.reshape(rows, (-1, 4, 4)), tracked(written), atol=1e-12)
-    camera = Camera((40.0, 42.0), (22.0, 20.5), 48, 40)
-    save_colmap(tmp_path, camera, ["a b.png"], np.eye(4)[None], np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
-    assert load_colmap(tmp_path).names == ["a b.png"]
 
 
 def test_frustums_are_coloured_by_status_and_the_path_is_cut_where_the_camera_was_lost(written):
