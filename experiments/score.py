@@ -25,14 +25,12 @@ from emgs_jax.report.results import METRICS_FILE, estimates_of, is_finished, res
 from emgs_jax.report.tables import average, full_table
 
 from .command import command
-from .keys import check_keys
 
 Metrics = dict[str, Any]
 
 
 def score(config: DictConfig) -> tuple[Metrics, Path]:
     """Compare the trajectory and the cloud of `config` with its data set; returns the metrics and their file."""
-    check_keys("score", config)
     evaluation = build(config, "evaluation")
     dataset = build_dataset(config)
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)

@@ -38,16 +38,15 @@ NOT_OF_RESULTS = (  # keys that change no number of a setting
 
 def refuse_other_maps(config: DictConfig, what: str) -> None:
     """Raise ValueError where the config asks for what settings cannot share."""
-    if config.baseline:
-        raise ValueError(f"baseline= is for run and evaluate: {what} compares settings, and no baseline has them")
-    if config.map:
-        raise ValueError(f"map= is for run and evaluate: {what} makes its own maps")
-    if config.graph:
-        raise ValueError(f"graph= is for run and evaluate: {what} steps many maps at once, and no loop closes in them")
-    if config.polish:
-        raise ValueError(f"polish= is for run and evaluate: {what} draws maps as they are")
-    if config.view:
-        raise ValueError(f"view= is for run and evaluate: {what} maps many settings at once")
+    for key, reason in {
+        "baseline": "compares settings, and no baseline has them",
+        "map": "makes its own maps",
+        "graph": "steps many maps at once, and no loop closes in them",
+        "polish": "draws maps as they are",
+        "view": "maps many settings at once",
+    }.items():
+        if config[key]:
+            raise ValueError(f"{key}= is for run and evaluate: {what} {reason}")
 
 
 def shared_settings(config: DictConfig) -> dict[str, Any]:

@@ -26,12 +26,18 @@ from emgs_jax.config.configure import compose, groups
 from emgs_jax.config.overrides import parsed, readable
 from emgs_jax.io.files import owned
 from experiments.cli import COMMANDS, main
-from experiments.command import check_arguments, check_missing, check_out, kept_words, leave_float32, nothing_left
+from experiments.command import (
+    check_arguments,
+    check_missing,
+    check_out,
+    first_words,
+    kept_words,
+    leave_float32,
+    nothing_left,
+)
 from experiments.console import speak_on
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
-from experiments.merge import positionals
-from experiments.report import positional
 
 
 @pytest.mark.parametrize(
@@ -116,7 +122,8 @@ def test_the_help_of_a_command_names_its_keys_and_its_examples_are_ones(name, mo
     assert not any(str(path) in said for path in (CONF.parent, Path.home(), Path(sys.prefix)))
     examples = [shlex.split(line) for line in said.splitlines() if line.startswith(f"  emgs {name} ")]
     assert len(examples) >= 2
-    rewritten = {"evaluate": delegated, "merge": positionals}.get(name, positional)
+    merged = first_words("folders", is_list=True)
+    rewritten = {"evaluate": delegated, "merge": merged}.get(name, first_words("folder"))
     for _, _, *words in examples:
         check_arguments(name, rewritten(words))
 
@@ -209,9 +216,11 @@ def test_a_choice_that_has_to_be_made_is_named_with_its_options():
 
 def test_a_folder_with_any_signs_is_the_first_word():
     for name in ("/runs/Küche (1), [a=b]", "it's", "outputs/a b"):
-        (word, *rest) = readable(positional(readable([name, "port=1"])))
+        (word, *rest) = readable(first_words("folder")(readable([name, "port=1"])))
         assert parsed(word).key_or_group == "folder" and parsed(word).value() == name and rest == ["port=1"]
-    assert positional(["folder=x"]) == ["folder=x"] and positional(["-m"]) == ["-m"]
+    for words in (["folder=x"], ["-m"], []):
+        assert first_words("folder")(words) == words == first_words("folders", is_list=True)(words)
+    assert first_words("folders", is_list=True)(["a", "b", "x=1"]) == ["folders=['a','b']", "x=1"]
 
 
 def test_a_folder_that_cannot_be_made_is_named_without_hydras_traceback(tmp_path):
