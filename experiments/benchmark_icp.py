@@ -13,12 +13,14 @@ from emgs_jax.gaussians import Gaussians, cluster, spacing
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.camera import downscale
 from emgs_jax.ops.clustering import morton_order
+from emgs_jax.ops.precision import full_precision
 from emgs_jax.registration.icp import icp
 from emgs_jax.registration.problem import CoarseStart
 
 from .timing import Candidate, Data, Timing, called, compare, interleaved, spread
 
 
+@full_precision
 def time_icp(data: Data, offset: tuple[float, float], repetitions: int) -> list[Timing]:
     """Coloured ICP against Open3D: every view but the first on the Gaussians of the first, from starts that are off."""
     config = data.config.localization.icp

@@ -131,7 +131,6 @@ OF_SCORE = [
         *({"method": "other"}, {"out": "{root}/elsewhere"}, moved(OUT, "away")),
     ),
     ({"method": "a/b"}, "must be a name that is one folder below .*: choose another", {"method": "ab"}),
-    ({"min_matched_percent": "many"}, "a number from 0 to (100).*: give such a value", {"min_matched_percent": "{1}"}),
 ]
 
 

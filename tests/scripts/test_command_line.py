@@ -77,12 +77,38 @@ def test_a_word_in_the_place_of_a_group_is_an_error_for_every_group():
             compose("prior=multiview_stereo", f"{group.replace('/', '.')}={groups()[group][0]}")
 
 
-def test_the_arguments_of_a_multirun_are_checked_and_those_of_hydra_are_left_to_it():
-    words = ["-m", "slam.em.noise=0,1", "prior=simulated,multiview_stereo", "hydra.run.dir=x"]
-    assert check_arguments("config", words) is None
-    for option in (["-m"], ["--cfg", "job"]):
-        with pytest.raises(ValueError, match=r"slam\.em\.nose is no key"):
-            check_arguments("config", [*option, "slam.em.nose=0,1"])
+FOLDER = r"hydra\.run\.dir=.*: .*file is no folder that can be written to"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("-m slam.em.nose=0,1", r"slam\.em\.nose is no key"),
+        ("--cfg job slam.em.nose=0,1", r"slam\.em\.nose is no key"),
+        ("dataset.root=my folder", "is no KEY=VALUE: put a value with spaces into quotes.*emgs run --help"),
+        ("dataset=images stop -m", "is no KEY=VALUE"),
+        ("hydra.run.dir=file", FOLDER),
+        ("hydra.run.dir=file/run", FOLDER),
+        ("--config-dir nowhere", "--config-dir nowhere is no folder"),
+        ("--config-dir own dataset=mine dataset.nothing=other", "is no key of the config"),
+        ("-m slam.em.noise=0,1 prior=simulated,multiview_stereo hydra.run.dir=x", None),
+        ("--cfg job --package slam ~hydra.run -m", None),
+        ("hydra.run.dir=new/run hydra.job.name=${out}", None),
+        ("--config-dir own dataset=mine dataset.root=other", None),
+        ("--config-dir=own dataset=mine", None),
+        ("-cd own dataset=mine", None),
+    ],
+)
+def test_words_are_checked_before_anything_begins_and_what_is_hydras_is_left_to_it(
+    words, message, tmp_path, monkeypatch
+):
+    """Of a folder that cannot be made Hydra tells by a traceback."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "own" / "dataset").mkdir(parents=True)
+    (tmp_path / "own" / "dataset" / "mine.yaml").write_text("_target_: emgs_jax.data.images.Images\nroot: walk\n")
+    with pytest.raises(ValueError, match=message) if message else contextlib.nullcontext():
+        check_arguments("config", words.split())
 
 
 def said_by(monkeypatch, capsys, *words: str) -> str:
@@ -189,27 +215,11 @@ def test_no_help_imports_what_computes():
     assert len(lines) == 2 + len(COMMANDS) and [line for line in lines if not line.endswith(" []")] == []
 
 
-def test_the_wrong_word_ends_a_command_with_one_line():
-    done = run("experiments.run", "slam.em=paper")
-    assert done.returncode == 1 and done.stderr.startswith("error: slam.em=paper would put a word")
-    assert "Traceback" not in done.stderr
-
-
-def test_a_word_that_is_no_override_says_how_to_write_it():
-    for words in (["dataset.root=my", "folder"], ["dataset=images", "stop", "-m"]):
-        with pytest.raises(ValueError, match=r"is no KEY=VALUE: put a value with spaces into quotes.*emgs run --help"):
-            check_arguments("config", words)
-    check_arguments("config", ["--cfg", "job", "--package", "slam", "~hydra.run", "-m"])
-
-
-def test_what_has_to_be_given_is_named_with_the_command():
-    for name, key in (("view", "folder"), ("report", "folder"), ("export", "folder"), ("effects", "folder")):
-        with pytest.raises(ValueError, match=f"^{key} is not given .*: emgs {name} {key}=…$"):
+def test_what_has_to_be_given_is_named_with_the_command_or_its_options():
+    for name in ("view", "report", "export", "effects"):
+        with pytest.raises(ValueError, match=f"^folder is not given .*: emgs {name} folder=…$"):
             check_missing(name, compose(name=name))
     check_missing("view", compose("folder=x", name="view"))
-
-
-def test_a_choice_that_has_to_be_made_is_named_with_its_options():
     with pytest.raises(ValueError, match="^features is not given: choose features= one of dinov2_text, dinov3_text"):
         compose(name="embed")
 
@@ -223,14 +233,6 @@ def test_a_folder_with_any_signs_is_the_first_word():
     assert first_words("folders", is_list=True)(["a", "b", "x=1"]) == ["folders=['a','b']", "x=1"]
 
 
-def test_a_folder_that_cannot_be_made_is_named_without_hydras_traceback(tmp_path):
-    (tmp_path / "file").write_text("")
-    for folder in (tmp_path / "file", tmp_path / "file" / "run"):
-        with pytest.raises(ValueError, match=r"hydra\.run\.dir=.*: .*file is no folder that can be written to"):
-            check_arguments("config", [f"hydra.run.dir={folder}"])
-    check_arguments("config", [f"hydra.run.dir={tmp_path / 'new' / 'run'}", "hydra.run.dir=${out}"])
-
-
 def test_an_output_that_cannot_be_written_is_named_before_the_work(tmp_path):
     """`emgs score … out=FILE` and `emgs predict` on a disk that is read-only said it after all of the work."""
     (tmp_path / "file").write_text("")
@@ -240,18 +242,6 @@ def test_an_output_that_cannot_be_written_is_named_before_the_work(tmp_path):
     for out in (None, "???", str(tmp_path / "new" / "folder"), str(tmp_path / "text.npz"), "relative"):
         check_out(OmegaConf.create({"out": out}))
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_options_of_a_folder_of_ones_own_are_options(tmp_path):
-    """`--config-dir` is in Hydra's help, and what stood in that folder was refused."""
-    (tmp_path / "dataset").mkdir()
-    (tmp_path / "dataset" / "mine.yaml").write_text("_target_: emgs_jax.data.images.Images\nroot: walk\n")
-    for option in (["--config-dir", str(tmp_path)], [f"--config-dir={tmp_path}"], ["-cd", str(tmp_path)]):
-        check_arguments("config", [*option, "dataset=mine", "dataset.root=other"])
-        with pytest.raises(ValueError, match="is no key of the config"):
-            check_arguments("config", [*option, "dataset=mine", "dataset.nothing=other"])
-    with pytest.raises(ValueError, match="--config-dir nowhere is no folder"):
-        check_arguments("config", ["--config-dir", "nowhere"])
 
 
 def test_a_command_that_comes_to_nothing_leaves_nothing(tmp_path, monkeypatch):
@@ -285,30 +275,24 @@ def test_numbers_of_64_bits_are_turned_off_and_that_is_said(monkeypatch, capsys)
     assert not capsys.readouterr().out
 
 
-def test_a_command_that_is_refused_leaves_the_folder_of_the_one_that_is_in_it(tmp_path, monkeypatch):
-    """Two runs of the same second: the second was refused, and removed the folder of the first, which then failed."""
-    monkeypatch.setattr("experiments.command.HydraConfig", SimpleNamespace(get=lambda: hydra_of(tmp_path)))
-    (tmp_path / ".hydra").mkdir()
-    (tmp_path / "run.log").touch()
-    with owned(tmp_path), pytest.raises(ValueError, match="another program"), nothing_left(), owned(tmp_path):
-        pass
-    assert {path.name for path in tmp_path.iterdir()} == {".hydra", "run.log"}
-
-
-@pytest.mark.parametrize("own", ["notes.log", "session.log/frames.csv", "run.log", None])
+@pytest.mark.parametrize("own", ["notes.log", "session.log/frames.csv", "run.log", "held", None])
 @pytest.mark.parametrize("has_log", [True, False])
 def test_a_command_that_comes_to_nothing_removes_nothing_that_was_there(own, has_log, tmp_path, monkeypatch):
-    """`emgs report typo` in a folder of logs removed it with all of them, and an empty one where the user stood."""
+    """`emgs report typo` in a folder of logs removed it with all of them, an empty one where the user stood, and a run
+    of the same second the folder of the one before, which held it."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("experiments.command.HydraConfig", SimpleNamespace(get=lambda: hydra_of(tmp_path, has_log)))
     if has_log:
         (tmp_path / "run.log").touch()
-    if own is not None:
+    if own not in ("held", None):
         (tmp_path / own).parent.mkdir(exist_ok=True)
         (tmp_path / own).write_text("mine")
-    with pytest.raises(ValueError, match="wrong"), nothing_left():
+    before = {path: path.is_file() and path.read_text() for path in tmp_path.rglob("*")}
+    holder, message = (owned(tmp_path), "another program") if own == "held" else (contextlib.nullcontext(), "wrong")
+    with holder, pytest.raises(ValueError, match=message), nothing_left(), owned(tmp_path):
         raise ValueError("wrong")
-    assert tmp_path.is_dir() and (own is None or (tmp_path / own).read_text() == "mine")
+    assert tmp_path.is_dir()
+    assert own is None or before == {path: path.is_file() and path.read_text() for path in tmp_path.rglob("*")}
 
 
 def hydra_of(folder: Path, has_log: bool = True) -> SimpleNamespace:
@@ -322,7 +306,7 @@ def test_a_name_with_any_signs_is_read_and_a_run_of_nothing_leaves_nothing(tmp_p
     folder = tmp_path / "my runs" / "first"
     done = run("experiments.run", "dataset=images", "dataset.root=Küche (1)", f"hydra.run.dir={folder}")
     assert done.returncode == 1 and done.stderr.startswith("error: dataset.root=Küche (1) does not exist")
-    assert not folder.exists()
+    assert "Traceback" not in done.stderr and not folder.exists()
 
 
 @pytest.mark.parametrize("word", ["terminated", "interrupted"])
@@ -468,21 +452,3 @@ def test_the_folder_of_several_runs_is_known_before_the_first(name):
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF.resolve())):
         config = hydra.compose(name, return_hydra_config=True)
     assert re.fullmatch(rf"multirun/({name}/)?synthetic/[\d_-]+", config.hydra.sweep.dir)
-
-
-def test_executables_from_the_cache_are_loaded_without_a_word(tmp_path):
-    """Symptom: the second `emgs predict prior=multiview_stereo` printed 48 errors of three thousand characters."""
-    script = (
-        "import logging, emgs_jax; from experiments.command import TALKATIVE\n"
-        "for library in TALKATIVE: logging.getLogger(library).setLevel(logging.WARNING)\n"
-        "import jax, jax.numpy as jnp\n"
-        "jax.jit(lambda x: jnp.sum(x[jnp.argsort(x)]))(jnp.arange(100.0))\n"
-    )
-    kept = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    environment = {k: v for k, v in os.environ.items() if k != "TF_CPP_MIN_LOG_LEVEL"} | kept
-    for _ in range(2):
-        done = subprocess.run(
-            [sys.executable, "-c", script], env=environment, cwd=CONF.parent, capture_output=True, text=True, check=True
-        )
-        assert "cpu_aot_loader" not in done.stderr
-    assert any(tmp_path.iterdir())

@@ -99,15 +99,6 @@ def test_only_what_stands_between_the_markers_changes_and_a_second_time_nothing_
     assert page.read_text() == once
 
 
-@pytest.mark.parametrize("page", [PAGE.replace("some", "none"), PAGE + PAGE, PAGE.replace("<!-- end -->", "")])
-def test_a_page_without_its_markers_stays_as_it_is(tmp_path, page):
-    path = tmp_path / "page.md"
-    path.write_text(page)
-    with pytest.raises(ValueError, match="not one"):
-        write_blocks(path, {"some": "new"})
-    assert path.read_text() == page
-
-
 @pytest.fixture
 def settings(tmp_path):
     """conf/tables.yaml with the built-in room alone."""
