@@ -132,16 +132,13 @@ class Measured:
         total = len(self.dataset) * num_left
         with tqdm(total=total, unit="frame", desc=self.name, disable=not chunks) as bar:
             for chunk in chunks:
-                self._results.add([one.setting for one in chunk], map_and_score(self, chunk, bar))
+                prior = self._priors[chunk[0].slam.window_size]
+                self._results.add([one.setting for one in chunk], map_and_score(self, prior, chunk, bar))
         return num_left
 
     def rows(self, settings: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Return a flat row for each setting that was measured: its number, its values and its metrics."""
         return self._results.rows([plain_setting(setting) for setting in settings])
-
-    def prior_of(self, chunk: Sequence[Variant]) -> Prior:
-        """The prior that is asked for settings that share a program."""
-        return self._priors[chunk[0].slam.window_size]
 
     def forget_predictions(self) -> None:
         """Remove what was recorded."""
@@ -157,15 +154,15 @@ def replayed(prior: Prior, dataset: ReadableFrames, window_size: int, folder: Pa
     return Recorded(path)
 
 
-def map_and_score(sequence: Measured, chunk: Sequence[Variant], bar: tqdm) -> list[Metrics]:
-    """Map and score some settings that share a program; the metrics of each."""
+def map_and_score(sequence: Measured, prior: Prior, chunk: Sequence[Variant], bar: tqdm) -> list[Metrics]:
+    """Map and score some settings that share a program by the answers of a prior; the metrics of each."""
     dataset, scorer = sequence.dataset, sequence.scorer
     groups = start = [new_run(dataset, variant.slam, sequence.clock) for variant in chunk]
     at_once, num_threads = side_by_side(sequence.config, len(chunk))
 
     def frames() -> Iterator[tuple[None, RawView]]:
         nonlocal groups
-        for found in map_together(start, dataset, sequence.prior_of(chunk), at_once, num_threads):
+        for found in map_together(start, dataset, prior, at_once, num_threads):
             groups, views = found
             bar.update(len(views) * len(chunk))
             yield from ((None, view) for view in views)

@@ -141,11 +141,7 @@ OF_TUM = [
     ),
     (put(COLOR, b"version https://git-lfs.github.com"), "Git LFS .*git lfs pull fetches it", fetched(COLOR)),
     (put(DEPTH, np.zeros((480, 640), np.uint8)), "must be a 16-bit depth image", fetched(DEPTH), SKIP),
-    (
-        resized(COLOR, (320, 240)),
-        "resize the file, or .*, or set on_bad_frame=skip",
-        *(resized(COLOR, (640, 480)), SKIP),
-    ),
+    (resized(COLOR, (320, 240)), "the file, or .*, or set on_bad_frame=skip", *(resized(COLOR, (640, 480)), SKIP)),
     (
         tuple(resized(image, (320, 240)) for image in IMAGES),
         "is 320x240, .* or give dataset.intrinsics for the images that are there",
@@ -189,11 +185,7 @@ OF_TUM = [
     ((LABELS, {"labels": "classes"}), "is no folder: give one with a class image", {"labels": "semantic"}),
     ((LABELS, put(LABEL, np.zeros((4, 4, 3), np.uint8))), "write the ids, not their colours", put(LABEL, WALL)),
     ((LABELS, put(LABEL, np.uint8(WALL + 40))), "write it with 16 bits", put(LABEL, WALL + 296)),
-    (
-        (LABELS, put(LABEL, WALL + 3)),
-        r"give the class file of this data set, or say with dataset\.(unknown)=",
-        *({"unknown": [0, 7]}, put(CLASSES, "4 wall\n7 cup\n")),
-    ),
+    ((LABELS, put(LABEL, WALL + 3)), r"dataset\.(unknown)=", *({"unknown": [0, 7]}, put(CLASSES, "4 wall\n7 cup\n"))),
     ((LABELS, {"unknown": "7"}), "must be a list of ids, whole numbers from 0", {"unknown": [0]}),
     (
         (listed, edit(TRUTH, ("100.9950 0.04", "100.9950 0.05")), {"checksums": "auto"}),
@@ -285,11 +277,7 @@ OF_EUROC = [
         "omni is not read, only none, .*: undistort .* and give the new",
         edit(SENSOR, ("omni", "none"), ("coefficients: [-0.02, 0.004, 0.001, -0.002]", "coefficients: []")),
     ),
-    (
-        {"camera": "cam1"},
-        r"cam1/data.csv is missing; expected the layout root/SEQUENCE/mav0/\{(cam0)",
-        {"camera": "{1}"},
-    ),
+    ({"camera": "cam1"}, r"is missing; expected the layout root/SEQUENCE/mav0/\{(cam0)", {"camera": "{1}"}),
     ({"max_time_difference": 1e-4}, "0 of 3 images have a pose", {"max_time_difference": 2e-3}, gone(STATES)),
     (edit(SENSOR, ("[160, 120]", "[752, 480]")), "is for images of 752x480, .*: give the calibration", fetched(SENSOR)),
     (edit(SENSOR, ("[160, 120]", "752")), r"resolution must have data: \[numbers\]: correct it", fetched(SENSOR)),
@@ -310,11 +298,7 @@ OF_COLMAP = [
     (edit(CAMERA, ("PINHOLE", "KANNALA")), "KANNALA is not read.*image_undistorter", fetched(CAMERA)),
     (edit(MODEL, (" 7 img33", " 8 img33")), "of camera 8, which has no line: export the model again", fetched(MODEL)),
     (edit(MODEL, ("img2.png", "img10.png")), "has img10.png twice: export the model again", fetched(MODEL)),
-    (
-        edit(MODEL, ("img2.png\n\n", "img2.png\n")),
-        "images.txt:5: expected .* or an empty line, .*: every image has two lines",
-        edit(MODEL, ("img2.png\n", "img2.png\n\n")),
-    ),
+    (edit(MODEL, ("img2.png\n\n", "img2.png\n")), "image has two lines", edit(MODEL, ("img2.png\n", "img2.png\n\n"))),
     (edit(MODEL, ("\n4 0", "\n4 7")), "images.txt:4: the pose is not finite .*: export the model", fetched(MODEL)),
     (edit(MODEL, ("img10.png", "")), "images.txt:2: expected IMAGE_ID QW.*: export the model again", fetched(MODEL)),
     (
@@ -440,21 +424,9 @@ OF_IMAGES = [
         "same numbers, such as 0.png and 0_mask.png: .* move the others .* into another folder",
         tuple(moved(f"{i}_mask.png", f"masks/{i}.png") for i in range(3)),
     ),
-    (
-        tuple(moved(f"{i}.png", f"rgb/{i}.png") for i in range(3)),
-        r"it has the folders (\w+): give one of them",
-        {"sequence": "{1}"},
-    ),
-    (
-        tuple(moved(f"{i}.png", f"{i}.heic") for i in range(3)),
-        "3 .heic, which are not read: convert them to jpg or png",
-        photos(),
-    ),
-    (
-        tuple(put(f"{i}.png", b"\0\0\0\x18ftypheic" + bytes(99)) for i in range(3)),
-        "HEIC.*: convert it to png or jpg",
-        photos(),
-    ),
+    (tuple(moved(f"{i}.png", f"rgb/{i}.png") for i in range(3)), r"(\w+): give one of them", {"sequence": "{1}"}),
+    (tuple(moved(f"{i}.png", f"{i}.heic") for i in range(3)), "are not read: convert them to jpg or png", photos()),
+    (tuple(put(f"{i}.png", b"\0\0\0\x18ftypheic" + bytes(99)) for i in range(3)), "convert it to png or jpg", photos()),
     ({"root": "{root}/0.png"}, "is neither a folder nor a video file", {"root": "{root}"}),
 ]
 
@@ -524,17 +496,8 @@ OF_PREDICTIONS = [
     (own(T_world_camera=None), "npz lacks T_world_camera; it has depth", own(), named_poses()),
     (own(depth=None), "must have depth or points, one of them", own()),
     (own(depth=lambda frame: frame.depth.ravel()), r"depth must be \(h, w\)", own()),
-    (
-        own(depth=lambda frame: frame.depth[:, :48]),
-        "where it was cropped, write it onto the whole image with 0 where nothing is known",
-        own(depth=unseen),
-    ),
-    (
-        in_unit(1000, 1000),
-        "no depth in metres: write metres, .* or prior.scale=arbitrary",
-        own(),
-        {"scale": "arbitrary"},
-    ),
+    (own(depth=lambda frame: frame.depth[:, :48]), "the whole image with 0 where nothing is known", own(depth=unseen)),
+    (in_unit(1000, 1000), "depth in metres: write metres, .* or prior.scale=arbitrary", own(), {"scale": "arbitrary"}),
     (
         (own(".png"), listed_poses(), {"depth_scale": 1.0}),
         r"give prior.depth_scale \(units of a metre in .png files; (1000): mm\)",
@@ -562,11 +525,7 @@ OF_PREDICTIONS = [
     ),
     (own(confidence=lambda frame: np.ones((4, 5))), r"confidence must be numbers \(48, 64\), as what it is of", own()),
     (own(intrinsics=lambda frame: [999, 999, 320, 240]), r"give those of the file's own size \(64x48\)", own()),
-    (
-        own(intrinsics=lambda frame: matrix(frame).T),
-        "must be fx 0 cx, 0 fy cy, 0 0 1, row by row, .*: transpose it",
-        own(intrinsics=matrix),
-    ),
+    (own(intrinsics=lambda frame: matrix(frame).T), "cy, 0 0 1, row by row, .*: transpose it", own(intrinsics=matrix)),
     (own(intrinsics=lambda frame: [1, 2, 3]), r"must be \[fx, fy, cx, cy\] or a camera matrix", own()),
     (own(depth=lambda frame: frame.depth * np.nan), "none of its 6 files has a depth above 0", own()),
     (
@@ -578,18 +537,10 @@ OF_PREDICTIONS = [
         ),
         {"names": [NAMES[0]] + NAMES[2:]},
     ),
-    (
-        {"names": ["a", "b", "c"]},
-        "name the files as the images, or choose the frames that were predicted",
-        *({"names": NAMES[:3]}, {"names": NAMES}),
-    ),
+    ({"names": ["a", "b", "c"]}, "or choose the frames that were predicted", *({"names": NAMES[:3]}, {"names": NAMES})),
     (put("own/IMG_9.npz", b"PK"), "IMG_9.npz: .*; it has nothing", own()),
     ((own(".npy"), listed_poses(), put("own/IMG_9.npy", b"x")), "no .npy that can be read .*: write it again", own()),
-    (
-        own(".npy"),
-        "neither of poses.txt, poses.json: prior=files needs poses beside depths",
-        *(listed_poses(), named_poses()),
-    ),
+    (own(".npy"), "of poses.txt, poses.json: prior=files needs poses beside depths", *(listed_poses(), named_poses())),
     (
         (own(".npy"), listed_poses(5)),
         "must have one for each, in the order of their names; or give poses.json, which has them by name",
@@ -733,18 +684,10 @@ RECTIFIED = {"topic": "/cam/image_rect"}
 OF_ROSBAG = [
     ({"root": None}, "give dataset.root=FOLDER", {"root": "{root}"}),
     ({"sequence": "run"}, r"has: (\w+)$", {"sequence": "{1}"}),
-    (
-        (put("notes/a.txt", ""), {"sequence": "notes"}),
-        "no bag that can be read .* or the folder of a ROS 2 bag with metadata.yaml",
-        {"sequence": "walk"},
-    ),
+    ((put("notes/a.txt", ""), {"sequence": "notes"}), "folder of a ROS 2 bag with metadata.yaml", {"sequence": "walk"}),
     ({"topic": "/eye"}, r"give dataset.(\w+)= one of (\S+)$", {"topic": "{2}"}),
     ({"info_topic": "/eye"}, r"give dataset.(info_topic)= one of (\S+)$", {"info_topic": "{2}"}),
-    (
-        bag(others=[{"name": "left"}]),
-        r"has several of sensor_msgs/Image: give dataset.topic= one of (\S+), (\S+)$",
-        *({"topic": "{1}"}, {"topic": "{2}"}),
-    ),
+    (bag(others=[{"name": "left"}]), r"dataset.topic= one of (\S+), (\S+)$", *({"topic": "{1}"}, {"topic": "{2}"})),
     (bag(info=False), "no camera_info, so dataset.intrinsics must say the camera", {"intrinsics": BAG_CAMERA}),
     (
         (bag(encoding="bayer_rggb8", others=[{"name": "rect"}]), {"topic": "/cam/image_raw"}),
@@ -756,11 +699,7 @@ OF_ROSBAG = [
         r"\(a rectified topic needs none of its distortion\).* and give the new calibration",
         *(RECTIFIED, {"intrinsics": BAG_CAMERA}),
     ),
-    (
-        bag(name="rect", P=np.zeros(12)),
-        "no P for the rectified .*: give dataset.intrinsics",
-        {"intrinsics": BAG_CAMERA},
-    ),
+    (bag(name="rect", P=np.zeros(12)), "P for the rectified .*: give dataset.intrinsics", {"intrinsics": BAG_CAMERA}),
     (bag(num_cut=9), "is not as large as it says: record it again, or set on_bad_frame=skip", bag(), SKIP),
     (bag(kind="CompressedImage", num_cut=99), "is damaged: record it again, or set on_bad_frame=skip", bag(), SKIP),
 ]
@@ -784,11 +723,7 @@ def read_masked(root: Path, on_bad_frame: str = "error", **keys) -> float:
 
 
 OF_MASKS = [
-    (
-        gone("masks/1.png"),
-        r"no mask for 1 .and 0 more.: give a folder with one image for each frame, (1\.png)",
-        fetched("masks/1.png"),
-    ),
+    (gone("masks/1.png"), r"0 more.: give a folder with one image for each frame, (1\.png)", fetched("masks/1.png")),
     ({"folder": "{root}/images/masks"}, "no mask for 0 .and 2 more", {"folder": "{root}/masks"}),
     (resized("masks/1.png", (120, 160)), "it is turned: make it of that size", resized("masks/1.png", EUROC_SIZE)),
     (resized("masks/1.png", (160, 160)), "but its image is 160x120: make it of", resized("masks/1.png", EUROC_SIZE)),
@@ -883,22 +818,14 @@ OF_DENSE = [
         "where it was cropped, write it onto the whole image with 0",
         lambda root, said: np.save(root / "npy/IMG_8.npy", np.where(np.arange(64) < 48, DENSE[0], 0)),
     ),
-    (
-        gone("npy/IMG_9.npy"),
-        "no file for 1 of 6 frames, the first is IMG_9: predict it, or leave the frame out .dataset.start, stop",
-        *(fetched("npy/IMG_9.npy"), {"names": [NAMES[0]] + NAMES[2:]}),
-    ),
+    (gone("npy/IMG_9.npy"), "out .dataset.start, stop", *(fetched("npy/IMG_9.npy"), {"names": [NAMES[0]] + NAMES[2:]})),
     (
         tuple(put(f"npy/{name}_conf.npy", b"") for name in NAMES)
         + tuple(moved(f"npy/{name}.npy", f"npy/{name}_d.npy") for name in NAMES),
         r"several kinds for each frame, \*_conf, \*_d: leave one kind",
         tuple(gone(f"npy/{name}_conf.npy") for name in NAMES),
     ),
-    (
-        {"names": ["a", "b", "c"]},
-        "name the files as the images, or choose the frames that were predicted",
-        *({"names": NAMES}, {"names": NAMES[:3]}),
-    ),
+    ({"names": ["a", "b", "c"]}, "or choose the frames that were predicted", *({"names": NAMES}, {"names": NAMES[:3]})),
     ({"depth_scale": 0.0}, "prior.dense.depth_scale must be raw units per metre, above 0", {"depth_scale": 1000.0}),
 ]
 ENCODER = {"encoder_str": "dinov2", "torch_hub_pretrained": False}
@@ -922,34 +849,17 @@ def read_network(root: Path, folder: str | None = "weights", **keys) -> bool:
 
 WEIGHTS = "weights/config.json"
 OF_NETWORKS = [
-    (
-        {"folder": None},
-        "prior.checkpoint is not set: download the weights once .* and name the FOLDER",
-        {"folder": "weights"},
-    ),
-    (
-        {"folder": "hub"},
-        "no config.json and no model.safetensors: prior.checkpoint is the FOLDER",
-        {"folder": "weights"},
-    ),
+    ({"folder": None}, "is not set: download the weights once .* and name the FOLDER", {"folder": "weights"}),
+    ({"folder": "hub"}, "config.json and no model.safetensors: prior.checkpoint is the FOLDER", {"folder": "weights"}),
     (put(WEIGHTS, "{"), "is no configuration of MapAnything .*: repeat", fetched(WEIGHTS)),
     (
         put(WEIGHTS, json.dumps({"encoder_config": {"encoder_str": "dinov2"}})),
         r'add ("torch_hub_pretrained": false) to its encoder_config',
         lambda root, said: put(WEIGHTS, f'{{"encoder_config": {{"encoder_str": "dinov2", {said[1]}}}}}')(root, said),
     ),
-    (
-        gone(f"hub/{DINOV2_CLONE}/hubconf.py"),
-        "clone .*dinov2 into that folder once",
-        fetched(f"hub/{DINOV2_CLONE}/hubconf.py"),
-    ),
+    (gone(f"hub/{DINOV2_CLONE}/hubconf.py"), "into that folder once", fetched(f"hub/{DINOV2_CLONE}/hubconf.py")),
     ({"model": "vgg"}, r"prior.model must be one of (\w+), ", {"model": "{1}"}),
-    (
-        {"resolution": "[50,50]"},
-        r"in multiples of (14), or (null)",
-        {"resolution": "[28,{1}]"},
-        {"resolution": "'{2}'"},
-    ),
+    ({"resolution": "[50,50]"}, r"multiples of (14), or (null)", {"resolution": "[28,{1}]"}, {"resolution": "'{2}'"}),
     ({"resolution": "[518]"}, "must be .width, height. in multiples of 14", {"resolution": "[518,392]"}),
     ({"anchor_pose": "maybe"}, r"must be (on) or (off)", {"anchor_pose": "'{1}'"}, {"anchor_pose": "'{2}'"}),
     ({"anchor_depth_m": 0}, "must be above 0 m", {"anchor_depth_m": 2}),

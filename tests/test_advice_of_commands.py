@@ -94,21 +94,13 @@ OF_SCORE = [
         r"3 of 6 poses.*: write the data set's timestamps .* or accept fewer \(min_associated_percent\)",
         *(fetched(PATH), {"min_associated_percent": 50}),
     ),
-    (
-        path_with(lambda times, poses: (times + 0.05, poses)),
-        "no pose is within .*, choose the same frames .*, raise max_time_difference",
-        {"max_time_difference": 0.06},
-    ),
+    (path_with(lambda times, poses: (times + 0.05, poses)), "raise max_time_difference", {"max_time_difference": 0.06}),
     (
         (path_with(lambda times, poses: (times[3:], poses[3:])), {"dataset.stop": 3}),
         r"choose the same frames \(dataset.start, stop, stride\)",
         {"dataset.stop": 6},
     ),
-    (
-        path_with(lambda times, poses: (times, np.linalg.inv(poses))),
-        "where the poses are taken as world -> camera: expected are",
-        fetched(PATH),
-    ),
+    (path_with(lambda times, poses: (times, np.linalg.inv(poses))), "as world -> camera: expected are", fetched(PATH)),
     (
         path_with(lambda times, poses: ([*times, *times], [*poses, *SIMILARITY.apply_to_poses(poses)])),
         "keep one path, with all digits of its times",
@@ -202,11 +194,7 @@ OF_EXPORT = [
         {"formats": "'{1}'"},
     ),
     ({"images": "large", "formats": "'[colmap]'"}, "images must be one of (used), original", {"images": "{1}"}),
-    (
-        gone("run/metrics.json"),
-        "holds no finished run: it lacks metrics.json; run it to its end",
-        fetched("run/metrics.json"),
-    ),
+    (gone("run/metrics.json"), "finished run: it lacks metrics.json; run it to its end", fetched("run/metrics.json")),
 ]
 
 
@@ -266,11 +254,7 @@ def read_search(root: Path, words: list[str]) -> tuple:
 
 
 OF_SWEEP = [
-    (
-        {"words": []},
-        r"choose one with (sweep=gates) or '(axes=\S+)'$",
-        *({"words": "['{1}']"}, {"words": '["{2}"]'}),
-    ),
+    ({"words": []}, r"choose one with (sweep=gates) or '(axes=\S+)'$", *({"words": "['{1}']"}, {"words": '["{2}"]'})),
     ({"words": ["axes={em.noise:[0]}"]}, r"near names: (slam\.em\.noise)", {"words": '["axes={{{1}:[0]}}"]'}),
     ({"words": ["axes={slam.em.noise:2}"]}, r"write (\S+): \[(\d), …\]", {"words": '["axes={{{1}:[{2},3]}}"]'}),
     (
@@ -278,11 +262,7 @@ OF_SWEEP = [
         "grid must be one of product, (one_at_a_time)",
         {"words": '["axes={{slam.em.noise:[0]}}", "grid={1}"]'},
     ),
-    (
-        {"words": ["axes={slam.em.noise:[-9]}"]},
-        r"from (\d) to \S+, got -9",
-        {"words": '["axes={{slam.em.noise:[{1}]}}"]'},
-    ),
+    ({"words": ["axes={slam.em.noise:[-9]}"]}, r"(\d) to \S+, got -9", {"words": '["axes={{slam.em.noise:[{1}]}}"]'}),
 ]
 
 
@@ -332,11 +312,7 @@ OF_MAP = [
     ({"words": ()}, "needs the keyframes of a back end: add (graph=default)", {"words": f"['{{1}}', '{GRID[1]}']"}),
     ({"mode": "track"}, "map_mode must be one of (extend), (localize)", {"mode": "{1}"}, {"mode": "{2}"}),
     ({"folder": "walk"}, "is no folder: give that of a finished run", {"folder": "run"}),
-    (
-        gone("run/metrics.json"),
-        r"is not finished: the same command with hydra.run.dir=\S+run goes on",
-        fetched("run/metrics.json"),
-    ),
+    (gone("run/metrics.json"), r"the same command with hydra.run.dir=\S+run goes on", fetched("run/metrics.json")),
     (gone("run/places.npz"), "has no places.npz: map it again with graph=default", fetched("run/places.npz")),
     (put("run/places.npz", b"PK"), "no keyframes to continue from .*: map again with", fetched("run/places.npz")),
     (
@@ -344,11 +320,7 @@ OF_MAP = [
         r"was made with (graph.place_recognition.grid=\[8,6\]): give that here",
         {"words": "['graph=default', '{1}']"},
     ),
-    (
-        lambda root, said: write_mapped(root, 99),
-        "map.npz and places.npz are not of one run: map again",
-        lambda root, said: write_mapped(root),
-    ),
+    (lambda root, said: write_mapped(root, 99), "are not of one run: map again", lambda root, said: write_mapped(root)),
 ]
 
 
@@ -365,11 +337,7 @@ def read_segmentation(root: Path, **keys) -> str:
 TRUE_IDS = "truth/room.txt"
 WORDS = TextEmbeddings(("wall", "lamp"), np.eye(2, dtype=np.float32), (), {"prior": "simulated"})
 OF_SEGMENT = [
-    (
-        {"map": "[{root}/run,{root}/run]"},
-        "names a folder twice, .*: give each once",
-        {"map": "{root}/run"},
-    ),
+    ({"map": "[{root}/run,{root}/run]"}, "names a folder twice, .*: give each once", {"map": "{root}/run"}),
     ({"scenes": ["a", "b"]}, "give one name for each map", {"scenes": ["room"]}),
     ({"classes": None}, "has ids only: give their class file", {"classes": "{root}/truth/classes.txt"}),
     (
@@ -433,11 +401,7 @@ OF_GATE = [
     (put("gate.yaml", "["), "is no baseline .*: write one with .* write_gate=FILE", evaluated(write_gate="gate.yaml")),
     ({"shard": "1/2"}, "a gate needs the results of all jobs: run once more without shard", {"shard": "1/1"}),
     ({"shard": "0/2", "gate": None}, r"such as (\d/\d), got", {"shard": "'{1}'"}),
-    (
-        of_other_code,
-        "a gate is about what runs now: choose another out=FOLDER, or move them away",
-        *({"out": "there"}, moved("out", "away")),
-    ),
+    (of_other_code, "now: choose another out=FOLDER, or move them away", *({"out": "there"}, moved("out", "away"))),
     (
         {"gate": None, "write_gate": "new.yaml", "rounded": "again"},
         "must be a folder of results of the same jobs, .*: evaluate into it first",
@@ -480,11 +444,7 @@ def read_tables(root: Path, page: str = "page.md", is_dirty: bool = False, out: 
 
 OF_TABLES = [
     ({"page": "README"}, "give page=FILE and full_page=FILE with the places of the tables", {"page": "page.md"}),
-    (
-        put("page.md", "<!-- table: some -->\n"),
-        "not one: write the markers once",
-        fetched("page.md"),
-    ),
+    (put("page.md", "<!-- table: some -->\n"), "not one: write the markers once", fetched("page.md")),
     ({"is_dirty": True}, "of one commit without changes: commit, ", {"is_dirty": False}),
 ]
 

@@ -80,7 +80,7 @@ def test_a_sweep_that_is_stopped_keeps_its_chunks_and_goes_on_with_those_of_the_
     """On an accelerator a chunk is stacked, and stacks of other sizes may round otherwise."""
     chunks = []
 
-    def stopped(work, chunk, bar):
+    def stopped(work, prior, chunk, bar):
         chunks.append([variant.setting for variant in chunk])
         if len(chunks) == 2:
             raise KeyboardInterrupt

@@ -40,7 +40,7 @@ def measured(monkeypatch):
 
     chunks = Chunks()
 
-    def measure(work, chunk, bar):
+    def measure(work, prior, chunk, bar):
         if chunks.stop_after is not None and len(chunks) == chunks.stop_after:
             raise KeyboardInterrupt
         seed = work.prior.provenance.settings["seed"]
@@ -154,8 +154,8 @@ def test_a_metric_that_is_none_is_named_and_a_trial_without_a_value_fails_and_th
         experiments.tune.tune([*WORDS, "objectives=[minimize trajectory/ate_sim_m]"], tmp_path / "other")
     measure = experiments.together.map_and_score
 
-    def lost(work, chunk, bar):
-        found = measure(work, chunk, bar)
+    def lost(work, prior, chunk, bar):
+        found = measure(work, prior, chunk, bar)
         return [m | {ATE: None} if v.setting[GAP] == 4.0 else m for m, v in zip(found, chunk, strict=True)]
 
     monkeypatch.setattr(experiments.together, "map_and_score", lost)
