@@ -112,23 +112,16 @@ def log_of(logging: DictConfig) -> Path | None:
 
 
 def help_of(name: str) -> str:
-    """Return the help in conf/`name`.yaml: its first comment, and its own keys and choices as they stand there."""
-    lines = (CONF / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
-    blocks: dict[str, list[str]] = {}  # key at the left margin -> its lines; "" -> the comment above all of them
-    key = ""
-    for line in lines:
-        key = found[0] if (found := re.match(r"\w+", line)) else key
-        blocks.setdefault(key, []).append(line)
-    head, (_, *defaults) = (blocks.pop(key) for key in ("", "defaults"))
-    blocks.pop("hydra", None)
-    chosen = [line.strip("- ") for line in defaults if re.match(r"  - \w+: ", line)]
-    body = [*chosen, *(line for block in blocks.values() for line in block)]
-    needed = "".join(f" {line.partition(':')[0]}=…" for line in chosen if ": ???" in line)
-    more = [f"emgs {name}{needed} --cfg job shows every key with its value."]
-    if f"  - {RUN}" in defaults:
-        more.append("Every choice and key of a run is one here too: emgs run --help")
-    parts = ["\n".join(line.removeprefix("# ") for line in head), "\n".join(body).strip(), "\n".join(more)]
-    return "\n\n".join(parts)
+    """Return the help in conf/`name`.yaml: its first comment, and its own choices and keys as they stand there."""
+    text = (CONF / f"{name}.yaml").read_text(encoding="utf-8")
+    head, text = re.sub(r"^hydra:\n(?:(?:  .*)?\n)*", "", text, flags=re.MULTILINE).split("defaults:\n")
+    own = re.sub(r"^  - (?!\w+: ).*\n", "", text, flags=re.MULTILINE)  # neither files nor what Hydra is told
+    choices = re.sub(r"^  - ", "", own, flags=re.MULTILINE)
+    needed = "".join(f" {key}=…" for key in re.findall(r"^  - (\w+): \?\?\?", own, re.MULTILINE))
+    more = f"emgs {name}{needed} --cfg job shows every key with its value."
+    if f"  - {RUN}\n" in text:
+        more += "\nEvery choice and key of a run is one here too: emgs run --help"
+    return "\n\n".join([re.sub("^# ", "", head, flags=re.MULTILINE).strip(), choices.strip(), more])
 
 
 def words_of(arguments: list[str]) -> argparse.Namespace:

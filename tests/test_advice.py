@@ -139,7 +139,7 @@ OF_TUM = [
         "HEIC.*: convert it to png or jpg, .* or set on_bad_frame=skip",
         *(put(COLOR, color_image(1, (640, 480))), SKIP),
     ),
-    (put(COLOR, b"version https://git-lfs.github.com"), "Git LFS .*git lfs pull fetches it", fetched(COLOR)),
+    (put(COLOR, b"version https://git-lfs.github.com"), "Git LFS .*git lfs pull fetches it"),
     (put(DEPTH, np.zeros((480, 640), np.uint8)), "must be a 16-bit depth image", fetched(DEPTH), SKIP),
     (resized(COLOR, (320, 240)), "the file, or .*, or set on_bad_frame=skip", *(resized(COLOR, (640, 480)), SKIP)),
     (
@@ -148,18 +148,18 @@ OF_TUM = [
         {"intrinsics": [267.7, 269.6, 159.8, 123.55]},
     ),
     (edit(TRUTH, ("100.9950 0.04", "100.9950 x")), LINE, fetched(TRUTH), NO_LINE, SKIP),
-    (lines(TRUTH, lambda words: [*words[:-1], "9" * (words[0][1] == "0") + words[-1]]), LINE, fetched(TRUTH)),
-    (edit(TRUTH, ("0.01 0.02 0 0.0", "0.01 0.02 0 9e200 0.0")), "line 3: .* has not length 1: correct", fetched(TRUTH)),
-    (edit(TRUTH, (" 0 0.99", "")), "groundtruth.txt, line 3: expected a timestamp and 7 more", fetched(TRUTH)),
-    (edit(f"{TUM}/rgb.txt", ("\n101", "\nx01")), "rgb.txt, line 3: expected a timestamp", fetched(f"{TUM}/rgb.txt")),
+    (lines(TRUTH, lambda words: [*words[:-1], "9" * (words[0][1] == "0") + words[-1]]), LINE),
+    (edit(TRUTH, ("0.01 0.02 0 0.0", "0.01 0.02 0 9e200 0.0")), "line 3: .* has not length 1: correct"),
+    (edit(TRUTH, (" 0 0.99", "")), "groundtruth.txt, line 3: expected a timestamp and 7 more"),
+    (edit(f"{TUM}/rgb.txt", ("\n101", "\nx01")), "rgb.txt, line 3: expected a timestamp"),
     (shifted(x=4.5e5), "subtract one position from all of its lines", shifted(x=-4.5e5)),
-    (edit(TRUTH, ("9950 0.04", "9950 9900")), "line 3: has a position of .*, else correct this one", fetched(TRUTH)),
+    (edit(TRUTH, ("9950 0.04", "9950 9900")), "line 3: has a position of .*, else correct this one"),
     (
         edit(TRUTH, ("9950 0.04", "9950 400")),
         "correct the trajectory, or write nan where the pose is not known",
         *(fetched(TRUTH), edit(TRUTH, ("9950 400", "9950 nan"))),
     ),
-    (shifted(x=np.nan), "0 of 3 images have a true pose: fetch the trajectory again", fetched(TRUTH)),
+    (shifted(x=np.nan), "0 of 3 images have a true pose: fetch the trajectory again"),
     (
         (edit(TRUTH, ("99.9950 0.0", "99.9950 nan")), {"stop": 1}),
         r"or choose other images \(dataset.start, stop, stride\)",
@@ -246,32 +246,32 @@ OF_SEVEN = [
 
 CAM, TRAJECTORY = "cam_params.json", "office9/traj.txt"
 OF_REPLICA = [
-    (edit(CAM, ('"w"', '"width"')), 'must hold {"camera": {w, h, fx, fy, cx, cy, scale}}', fetched(CAM)),
+    (edit(CAM, ('"w"', '"width"')), 'must hold {"camera": {w, h, fx, fy, cx, cy, scale}}'),
     (
         (edit(TRAJECTORY, ("\n", "\n\n")), {"stop": 2}),
         "blank lines among its poses.*: take the lines out, or where an image has no pose write 16 times nan",
         *(fetched(TRAJECTORY), edit(TRAJECTORY, ("\n\n", f"\n{'nan ' * 16}\n"))),
     ),
-    (put(TRAJECTORY, "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n"), "1 poses, .*: fetch traj.txt again", fetched(TRAJECTORY)),
+    (put(TRAJECTORY, "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1\n"), "1 poses, .*: fetch traj.txt again"),
 ]
 
 TIMES, POSES, CALIB = "sequences/07/times.txt", "poses/07.txt", "sequences/07/calib.txt"
 OF_KITTI = [
-    (edit(TIMES, ("2.074e-01\n", "")), "2 lines for 3 images: fetch the sequence and this file again", fetched(TIMES)),
-    (edit(TIMES, ("0", "x")), "times.txt, line 1: must be 1 finite numbers.*: fetch it again", fetched(TIMES)),
-    (edit(POSES, (" ", " x ")), "07.txt, line 1: .* must be 12 numbers.*: fetch the file again", fetched(POSES)),
-    (edit(POSES, ("1.0", "3.0")), "07.txt, line 1: has a pose that is no rigid motion: fetch", fetched(POSES)),
-    (edit(CALIB, ("P2", "P9")), "has no P2: fetch the calibration files", fetched(CALIB)),
-    (edit(CALIB, ("P2: 9.2", "P2: -9.2")), "P2 must be that of a rectified camera.*: fetch it again", fetched(CALIB)),
+    (edit(TIMES, ("2.074e-01\n", "")), "2 lines for 3 images: fetch the sequence and this file again"),
+    (edit(TIMES, ("0", "x")), "times.txt, line 1: must be 1 finite numbers.*: fetch it again"),
+    (edit(POSES, (" ", " x ")), "07.txt, line 1: .* must be 12 numbers.*: fetch the file again"),
+    (edit(POSES, ("1.0", "3.0")), "07.txt, line 1: has a pose that is no rigid motion: fetch"),
+    (edit(CALIB, ("P2", "P9")), "has no P2: fetch the calibration files"),
+    (edit(CALIB, ("P2: 9.2", "P2: -9.2")), "P2 must be that of a rectified camera.*: fetch it again"),
     ({"camera": 0}, r"image_0 is no folder; expected the layout root/\{sequences/00/\{image_(2)", {"camera": "{1}"}),
-    (gone(TIMES), "times.txt is missing", fetched(TIMES)),
+    (gone(TIMES), "times.txt is missing"),
     ({"sequence": 9}, "sequences/09 does not exist; expected .*KITTI.* has: (07)", {"sequence": "{1}"}),
 ]
 
 MAV = "MH_01_easy/mav0"
 SENSOR, STATES = f"{MAV}/cam0/sensor.yaml", f"{MAV}/state_groundtruth_estimate0/data.csv"
 OF_EUROC = [
-    (edit(SENSOR, ("T_BS:", "T_SB:")), "has no T_BS, .*: fetch it again", fetched(SENSOR)),
+    (edit(SENSOR, ("T_BS:", "T_SB:")), "has no T_BS, .*: fetch it again"),
     (
         edit(SENSOR, ("radial-tangential", "omni")),
         "omni is not read, only none, .*: undistort .* and give the new",
@@ -279,9 +279,9 @@ OF_EUROC = [
     ),
     ({"camera": "cam1"}, r"is missing; expected the layout root/SEQUENCE/mav0/\{(cam0)", {"camera": "{1}"}),
     ({"max_time_difference": 1e-4}, "0 of 3 images have a pose", {"max_time_difference": 2e-3}, gone(STATES)),
-    (edit(SENSOR, ("[160, 120]", "[752, 480]")), "is for images of 752x480, .*: give the calibration", fetched(SENSOR)),
-    (edit(SENSOR, ("[160, 120]", "752")), r"resolution must have data: \[numbers\]: correct it", fetched(SENSOR)),
-    (edit(STATES, *[(",0.", ",7.")] * 4), "line 2: .*: correct the line or take it out", fetched(STATES)),
+    (edit(SENSOR, ("[160, 120]", "[752, 480]")), "is for images of 752x480, .*: give the calibration"),
+    (edit(SENSOR, ("[160, 120]", "752")), r"resolution must have data: \[numbers\]: correct it"),
+    (edit(STATES, *[(",0.", ",7.")] * 4), "line 2: .*: correct the line or take it out"),
 ]
 
 CAMERA, MODEL = "sparse/0/cameras.txt", "sparse/0/images.txt"
@@ -293,14 +293,14 @@ OF_COLMAP = [
         fetched(CAMERA),
         tuple(resized(f"images/img{number}.png", (320, 240)) for number in (2, 10, 33)),
     ),
-    (edit(CAMERA, ("160 120", "120 160")), "calibrate the images as they are shown", fetched(CAMERA)),
-    (edit(CAMERA, ("\n7 ", "\n7 SIMPLE 1\n8 ")), "cameras.txt:2: expected CAMERA_ID MODEL", fetched(CAMERA)),
-    (edit(CAMERA, ("PINHOLE", "KANNALA")), "KANNALA is not read.*image_undistorter", fetched(CAMERA)),
-    (edit(MODEL, (" 7 img33", " 8 img33")), "of camera 8, which has no line: export the model again", fetched(MODEL)),
-    (edit(MODEL, ("img2.png", "img10.png")), "has img10.png twice: export the model again", fetched(MODEL)),
+    (edit(CAMERA, ("160 120", "120 160")), "calibrate the images as they are shown"),
+    (edit(CAMERA, ("\n7 ", "\n7 SIMPLE 1\n8 ")), "cameras.txt:2: expected CAMERA_ID MODEL"),
+    (edit(CAMERA, ("PINHOLE", "KANNALA")), "KANNALA is not read.*image_undistorter"),
+    (edit(MODEL, (" 7 img33", " 8 img33")), "of camera 8, which has no line: export the model again"),
+    (edit(MODEL, ("img2.png", "img10.png")), "has img10.png twice: export the model again"),
     (edit(MODEL, ("img2.png\n\n", "img2.png\n")), "image has two lines", edit(MODEL, ("img2.png\n", "img2.png\n\n"))),
-    (edit(MODEL, ("\n4 0", "\n4 7")), "images.txt:4: the pose is not finite .*: export the model", fetched(MODEL)),
-    (edit(MODEL, ("img10.png", "")), "images.txt:2: expected IMAGE_ID QW.*: export the model again", fetched(MODEL)),
+    (edit(MODEL, ("\n4 0", "\n4 7")), "images.txt:4: the pose is not finite .*: export the model"),
+    (edit(MODEL, ("img10.png", "")), "images.txt:2: expected IMAGE_ID QW.*: export the model again"),
     (
         (put(CAMERA, FIRST + SECOND), edit(MODEL, (" 7 img33", " 8 img33"))),
         "2 different cameras: map those of one, or run COLMAP with --ImageReader.single_camera 1",
@@ -317,7 +317,7 @@ OF_COLMAP = [
             (put("1/cameras.txt", FIRST), put("1/images.txt", "3 1 0 0 0 0 0 0 7 img2.png\n\n"), {"model": "'1'"}),
         ),
     ),
-    (gone(MODEL), r"no cameras and images \(.txt or .bin\)", fetched(MODEL)),
+    (gone(MODEL), r"no cameras and images \(.txt or .bin\)"),
     (
         (moved(CAMERA, f"{CAMERA[:-3]}bin"), moved(MODEL, f"{MODEL[:-3]}bin")),
         r"cameras.bin is damaged: .*export",
@@ -336,16 +336,15 @@ def transforms(**changes) -> Step:
 
 
 FRAME = {"file_path": "images/img2.png", "transform_matrix": np.eye(4).tolist()}
-AGAIN = fetched("transforms.json")
 OF_NERFSTUDIO = [
-    (gone("transforms.json"), "transforms.json does not exist; expected the layout", AGAIN),
-    (transforms(frames=[FRAME | {"transform_matrix": [["x"] * 4] * 4}]), "must hold frames with", AGAIN),
-    (transforms(frames=[]), "has no frames: export it again", AGAIN),
-    (transforms(frames=[{"file_path": "images/img2.png"}]), "must hold frames with .*: export it again", AGAIN),
-    (transforms(frames=[FRAME | {"transform_matrix": [[1, 0], [0, 1]]}]), "4 rows of 4: export it again", AGAIN),
-    (transforms(frames=[FRAME | {"transform_matrix": np.ones((4, 4)).tolist()}]), "is no rigid motion", AGAIN),
-    (transforms(frames=[FRAME, FRAME]), "has images/img2.png twice: export it again", AGAIN),
-    (transforms(w=320, h=240), "is for images of 320x240, .*: give the calibration of these images", AGAIN),
+    (gone("transforms.json"), "transforms.json does not exist; expected the layout"),
+    (transforms(frames=[FRAME | {"transform_matrix": [["x"] * 4] * 4}]), "must hold frames with"),
+    (transforms(frames=[]), "has no frames: export it again"),
+    (transforms(frames=[{"file_path": "images/img2.png"}]), "must hold frames with .*: export it again"),
+    (transforms(frames=[FRAME | {"transform_matrix": [[1, 0], [0, 1]]}]), "4 rows of 4: export it again"),
+    (transforms(frames=[FRAME | {"transform_matrix": np.ones((4, 4)).tolist()}]), "is no rigid motion"),
+    (transforms(frames=[FRAME, FRAME]), "has images/img2.png twice: export it again"),
+    (transforms(w=320, h=240), "is for images of 320x240, .*: give the calibration of these images"),
     (transforms(fl_x=None), "has no fl_x: add what is missing, in pixels of the images", transforms(fl_x=130)),
     (
         transforms(frames=[FRAME, FRAME | {"file_path": "images/img10.png", "fl_x": 99}]),
@@ -440,7 +439,7 @@ def write_clip(root: Path) -> None:
 
 OF_CLIP = [
     ({"intrinsics": "exif"}, "a video has no EXIF: give dataset.intrinsics=", {"intrinsics": SQUARE}),
-    (put("clip.avi", b""), "clip.avi is empty: copy it again", fetched("clip.avi")),
+    (put("clip.avi", b""), "clip.avi is empty: copy it again"),
     (
         put("clip.avi", b"x" * 999),
         "no video that OpenCV can open: convert it to mp4 .h264. or to images",
@@ -494,8 +493,8 @@ OF_PREDICTIONS = [
     ({"folder": "{root}"}, r"has no file \*.npz, .* and no known layout \(docs", {"folder": "{root}/own"}),
     ({"folder": "{root}/nowhere"}, "does not exist: give the folder of predictions", {"folder": "{root}/own"}),
     (own(T_world_camera=None), "npz lacks T_world_camera; it has depth", own(), named_poses()),
-    (own(depth=None), "must have depth or points, one of them", own()),
-    (own(depth=lambda frame: frame.depth.ravel()), r"depth must be \(h, w\)", own()),
+    (own(depth=None), "must have depth or points, one of them"),
+    (own(depth=lambda frame: frame.depth.ravel()), r"depth must be \(h, w\)"),
     (own(depth=lambda frame: frame.depth[:, :48]), "the whole image with 0 where nothing is known", own(depth=unseen)),
     (in_unit(1000, 1000), "depth in metres: write metres, .* or prior.scale=arbitrary", own(), {"scale": "arbitrary"}),
     (
@@ -504,10 +503,10 @@ OF_PREDICTIONS = [
         {"depth_scale": "{1}"},
     ),
     (in_unit(1, 1000), r"the positions by (0\.001)", in_unit(1, 1)),
-    (pose_of(lambda T: T * [2, 2, 2, 1]), "no rigid motion within 1e\\+06: camera -> world is expected", own()),
-    (pose_of(INVERSE), "taken as world -> camera: expected are poses camera -> world", own()),
-    (pose_of(lambda T: T * FLIP), "as camera -> world of OpenGL's axes: expected", own()),
-    (own(depth=lambda frame: 1 / frame.depth), r"/ depth: expected are .* depths along z", own()),
+    (pose_of(lambda T: T * [2, 2, 2, 1]), "no rigid motion within 1e\\+06: camera -> world is expected"),
+    (pose_of(INVERSE), "taken as world -> camera: expected are poses camera -> world"),
+    (pose_of(lambda T: T * FLIP), "as camera -> world of OpenGL's axes: expected"),
+    (own(depth=lambda frame: 1 / frame.depth), r"/ depth: expected are .* depths along z"),
     (
         own(depth=lambda frame: frame.depth * (0.5 + frame.index % 2)),
         r"a scale, .* of their own in each: align them .* prior.max_misfit=([\d.]+) maps them as they are",
@@ -523,11 +522,11 @@ OF_PREDICTIONS = [
         "is inf: give finite numbers",
         own(confidence=lambda frame: np.full(frame.depth.shape, 9.0)),
     ),
-    (own(confidence=lambda frame: np.ones((4, 5))), r"confidence must be numbers \(48, 64\), as what it is of", own()),
-    (own(intrinsics=lambda frame: [999, 999, 320, 240]), r"give those of the file's own size \(64x48\)", own()),
+    (own(confidence=lambda frame: np.ones((4, 5))), r"confidence must be numbers \(48, 64\), as what it is of"),
+    (own(intrinsics=lambda frame: [999, 999, 320, 240]), r"give those of the file's own size \(64x48\)"),
     (own(intrinsics=lambda frame: matrix(frame).T), "cy, 0 0 1, row by row, .*: transpose it", own(intrinsics=matrix)),
-    (own(intrinsics=lambda frame: [1, 2, 3]), r"must be \[fx, fy, cx, cy\] or a camera matrix", own()),
-    (own(depth=lambda frame: frame.depth * np.nan), "none of its 6 files has a depth above 0", own()),
+    (own(intrinsics=lambda frame: [1, 2, 3]), r"must be \[fx, fy, cx, cy\] or a camera matrix"),
+    (own(depth=lambda frame: frame.depth * np.nan), "none of its 6 files has a depth above 0"),
     (
         gone("own/IMG_9.npz"),
         "predict it, write one whose T_world_camera is nan, or leave the frame out .dataset.start, stop, stride",
@@ -538,8 +537,8 @@ OF_PREDICTIONS = [
         {"names": [NAMES[0]] + NAMES[2:]},
     ),
     ({"names": ["a", "b", "c"]}, "or choose the frames that were predicted", *({"names": NAMES[:3]}, {"names": NAMES})),
-    (put("own/IMG_9.npz", b"PK"), "IMG_9.npz: .*; it has nothing", own()),
-    ((own(".npy"), listed_poses(), put("own/IMG_9.npy", b"x")), "no .npy that can be read .*: write it again", own()),
+    (put("own/IMG_9.npz", b"PK"), "IMG_9.npz: .*; it has nothing"),
+    ((own(".npy"), listed_poses(), put("own/IMG_9.npy", b"x")), "no .npy that can be read .*: write it again"),
     (own(".npy"), "of poses.txt, poses.json: prior=files needs poses beside depths", *(listed_poses(), named_poses())),
     (
         (own(".npy"), listed_poses(5)),
@@ -569,15 +568,14 @@ def read_own(root: Path, names: list[str] = NAMES, folder: str | None = None, **
     return len([prior.predict(call, [known[i] for i in call.views], found.intrinsics) for call in calls])
 
 
-CALIBRATIONS = {
-    "cameras.txt": f"1 PINHOLE 640 480 500.5 502.25 {CORNER}\n",
-    "transforms.json": json.dumps(TRANSFORMS),
-    "info.yaml": ROS,
-    "orb.yaml": ORB,
-    "camchain.yaml": KALIBR,
-    "intrinsics.yaml": MAST3R,
-    "vipe.json": json.dumps(OF_VIPE),
-}
+def write_calibrations(root: Path) -> None:
+    put("cameras.txt", f"1 PINHOLE 640 480 500.5 502.25 {CORNER}\n")(root, None)
+    put("transforms.json", json.dumps(TRANSFORMS))(root, None)
+    put("vipe.json", json.dumps(OF_VIPE))(root, None)
+    for name, text in {"info": ROS, "orb": ORB, "camchain": KALIBR, "intrinsics": MAST3R}.items():
+        put(f"{name}.yaml", text)(root, None)
+
+
 OTHER_MODEL = "1 FISHEYE624 640 480 500 500 320 240 0 0 0 0 0 0 0 0\n"
 LENS_OF_ROS = "[0.1, -0.2, 1e-3, -0.002, 0.05]"
 FOREIGN = [
@@ -620,10 +618,7 @@ FOREIGN = [
     ("intrinsics.yaml", MAST3R.split("calib")[0] + "calibration: pinhole\n", r"must have data: \[numbers\]"),
     ("vipe.json", json.dumps(OF_VIPE | {"fx": None}), "fx must be a finite number"),
 ]
-OF_CALIBRATIONS = [
-    ((put(name, text), {"file": name}), f"(?s){name}.*{message}", put(name, CALIBRATIONS[name]))
-    for name, text, message in FOREIGN
-]
+OF_CALIBRATIONS = [((put(name, text), {"file": name}), f"(?s){name}.*{message}") for name, text, message in FOREIGN]
 OVO = "class_names_reduced: [wall, chair]\nmap_to_reduced: {93: 0, 20: 1}\n"
 OF_CLASSES = [
     (
@@ -723,18 +718,14 @@ def read_masked(root: Path, on_bad_frame: str = "error", **keys) -> float:
 
 
 OF_MASKS = [
-    (gone("masks/1.png"), r"0 more.: give a folder with one image for each frame, (1\.png)", fetched("masks/1.png")),
+    (gone("masks/1.png"), r"0 more.: give a folder with one image for each frame, (1\.png)"),
     ({"folder": "{root}/images/masks"}, "no mask for 0 .and 2 more", {"folder": "{root}/masks"}),
     (resized("masks/1.png", (120, 160)), "it is turned: make it of that size", resized("masks/1.png", EUROC_SIZE)),
     (resized("masks/1.png", (160, 160)), "but its image is 160x120: make it of", resized("masks/1.png", EUROC_SIZE)),
     (put("masks/1.png", b"none"), "fetch the file again or set on_bad_frame=skip", fetched("masks/1.png"), SKIP),
     ({"classes": ["cat"]}, "masks.names, the file that names the ids", NAMED),
     (({"classes": ["dog"]}, NAMED), r"are no classes of .*, (\w+)$", {"classes": "['{1}']"}),
-    (
-        ({"classes": ["cat"]}, NAMED, put("names.txt", "7 person\n9 cat\n")),
-        "no name in .* for id 255: give the class file of this data set$",
-        fetched("names.txt"),
-    ),
+    (({"classes": ["cat"]}, NAMED, put("names.txt", "7 person\n9 cat\n")), "give the class file of this data set$"),
 ]
 
 
@@ -851,13 +842,13 @@ WEIGHTS = "weights/config.json"
 OF_NETWORKS = [
     ({"folder": None}, "is not set: download the weights once .* and name the FOLDER", {"folder": "weights"}),
     ({"folder": "hub"}, "config.json and no model.safetensors: prior.checkpoint is the FOLDER", {"folder": "weights"}),
-    (put(WEIGHTS, "{"), "is no configuration of MapAnything .*: repeat", fetched(WEIGHTS)),
+    (put(WEIGHTS, "{"), "is no configuration of MapAnything .*: repeat"),
     (
         put(WEIGHTS, json.dumps({"encoder_config": {"encoder_str": "dinov2"}})),
         r'add ("torch_hub_pretrained": false) to its encoder_config',
         lambda root, said: put(WEIGHTS, f'{{"encoder_config": {{"encoder_str": "dinov2", {said[1]}}}}}')(root, said),
     ),
-    (gone(f"hub/{DINOV2_CLONE}/hubconf.py"), "into that folder once", fetched(f"hub/{DINOV2_CLONE}/hubconf.py")),
+    (gone(f"hub/{DINOV2_CLONE}/hubconf.py"), "into that folder once"),
     ({"model": "vgg"}, r"prior.model must be one of (\w+), ", {"model": "{1}"}),
     ({"resolution": "[50,50]"}, r"multiples of (14), or (null)", {"resolution": "[28,{1}]"}, {"resolution": "'{2}'"}),
     ({"resolution": "[518]"}, "must be .width, height. in multiples of 14", {"resolution": "[518,392]"}),
@@ -939,11 +930,7 @@ OF_STRUCTURE = [
     ({"model": "nowhere"}, "does not exist: give the folder of a COLMAP model", {"model": "model"}),
     ((put("empty/a", ""), {"model": "empty"}), "empty holds no model of COLMAP", {"model": "model"}),
     ((put("empty/database.db", "x"), {"model": "empty"}), "is no database of COLMAP, or a dam", {"model": "model"}),
-    (
-        lambda root, said: (root / "model/points3D.bin").write_bytes(b"x"),
-        "is damaged: .*export the model again",
-        fetched("model/points3D.bin"),
-    ),
+    (lambda root, said: (root / "model/points3D.bin").write_bytes(b"x"), "is damaged: .*export the model again"),
     (
         {"names": ["0", "1", "2"]},
         "it has 00, 01, 02, …, this run 0, 1, 2, …; names count without folder and suffix",
@@ -973,7 +960,7 @@ TABLES = {
     "images": (write_folder, frames(Images, intrinsics=SQUARE), OF_IMAGES),
     "clip": (write_clip, frames(Images, sequence="clip.avi", intrinsics=SQUARE), OF_CLIP),
     "predictions": (lambda root: write_npz(root / "own", NAMES), read_own, OF_PREDICTIONS),
-    "calibration": (lambda root: None, lambda root, file: read_calibration(root / file), OF_CALIBRATIONS),
+    "calibration": (write_calibrations, lambda root, file: read_calibration(root / file), OF_CALIBRATIONS),
     "classes": (lambda root: None, lambda root, file: read_classes(root / file), OF_CLASSES),
 }
 

@@ -100,15 +100,15 @@ OF_SCORE = [
         r"choose the same frames \(dataset.start, stop, stride\)",
         {"dataset.stop": 6},
     ),
-    (path_with(lambda times, poses: (times, np.linalg.inv(poses))), "as world -> camera: expected are", fetched(PATH)),
+    (path_with(lambda times, poses: (times, np.linalg.inv(poses))), "as world -> camera: expected are"),
     (
         path_with(lambda times, poses: ([*times, *times], [*poses, *SIMILARITY.apply_to_poses(poses)])),
         "keep one path, with all digits of its times",
         *(fetched(PATH), path_with(lambda times, poses: ([*times, *times + 0.001], [*poses, *poses]))),
     ),
-    (gone(PATH), "path.txt is no file: give a file with `timestamp tx ty tz qx qy qz qw`", fetched(PATH)),
-    (put(PATH, "1 2 3\n"), "path.txt:1: expected `timestamp tx ty tz qx qy qz qw`", fetched(PATH)),
-    (gone(PLY), "cloud.ply is no file: give a PLY file", fetched(PLY)),
+    (gone(PATH), "path.txt is no file: give a file with `timestamp tx ty tz qx qy qz qw`"),
+    (put(PATH, "1 2 3\n"), "path.txt:1: expected `timestamp tx ty tz qx qy qz qw`"),
+    (gone(PLY), "cloud.ply is no file: give a PLY file"),
     (put(PLY, "# nothing\n"), "cloud.ply is no PLY file .*: give a PLY file", fetched(PLY)),
     (cloud_of(SPREAD[:0]), "cloud.ply has no points: write the points of the map as PLY", cloud_of(SPREAD)),
     (cloud_of(FAR), "give the points in metres, and without stray ones", cloud_of(SPREAD)),
@@ -194,7 +194,7 @@ OF_EXPORT = [
         {"formats": "'{1}'"},
     ),
     ({"images": "large", "formats": "'[colmap]'"}, "images must be one of (used), original", {"images": "{1}"}),
-    (gone("run/metrics.json"), "finished run: it lacks metrics.json; run it to its end", fetched("run/metrics.json")),
+    (gone("run/metrics.json"), "finished run: it lacks metrics.json; run it to its end"),
 ]
 
 
@@ -312,9 +312,9 @@ OF_MAP = [
     ({"words": ()}, "needs the keyframes of a back end: add (graph=default)", {"words": f"['{{1}}', '{GRID[1]}']"}),
     ({"mode": "track"}, "map_mode must be one of (extend), (localize)", {"mode": "{1}"}, {"mode": "{2}"}),
     ({"folder": "walk"}, "is no folder: give that of a finished run", {"folder": "run"}),
-    (gone("run/metrics.json"), r"the same command with hydra.run.dir=\S+run goes on", fetched("run/metrics.json")),
-    (gone("run/places.npz"), "has no places.npz: map it again with graph=default", fetched("run/places.npz")),
-    (put("run/places.npz", b"PK"), "no keyframes to continue from .*: map again with", fetched("run/places.npz")),
+    (gone("run/metrics.json"), r"the same command with hydra.run.dir=\S+run goes on"),
+    (gone("run/places.npz"), "has no places.npz: map it again with graph=default"),
+    (put("run/places.npz", b"PK"), "no keyframes to continue from .*: map again with"),
     (
         {"words": ("graph=default",)},
         r"was made with (graph.place_recognition.grid=\[8,6\]): give that here",
@@ -346,9 +346,9 @@ OF_SEGMENT = [
         {"scenes": "{1}"},
         (fetched(TRUE_IDS), fetched("truth/room_mesh.ply")),
     ),
-    (put(TRUE_IDS, "5\n9\n"), "has 2 labels and .*: fetch both files of the same mesh", fetched(TRUE_IDS)),
-    (put(TRUE_IDS, "wall\n"), "is no list of whole numbers, .*: fetch it again", fetched(TRUE_IDS)),
-    (put("truth/classes.txt", "5 wall\n"), "give the class file of this data set", fetched("truth/classes.txt")),
+    (put(TRUE_IDS, "5\n9\n"), "has 2 labels and .*: fetch both files of the same mesh"),
+    (put(TRUE_IDS, "wall\n"), "is no list of whole numbers, .*: fetch it again"),
+    (put("truth/classes.txt", "5 wall\n"), "give the class file of this data set"),
     (
         put("truth/classes.txt", "5 wall\n9 lamp\n"),
         r"there are wall, (sofa)\. For other words give embeddings \(features.text=FILE of emgs embed\)",
@@ -444,7 +444,7 @@ def read_tables(root: Path, page: str = "page.md", is_dirty: bool = False, out: 
 
 OF_TABLES = [
     ({"page": "README"}, "give page=FILE and full_page=FILE with the places of the tables", {"page": "page.md"}),
-    (put("page.md", "<!-- table: some -->\n"), "not one: write the markers once", fetched("page.md")),
+    (put("page.md", "<!-- table: some -->\n"), "not one: write the markers once"),
     ({"is_dirty": True}, "of one commit without changes: commit, ", {"is_dirty": False}),
 ]
 
@@ -459,7 +459,7 @@ def read_polish(root: Path, folder: str = "run", words: Sequence[str] = ()) -> s
 OF_POLISH = [
     ({"words": ["polish=none"]}, "choose (polish=default)", {"words": "['{1}']"}),
     ({"folder": "walk"}, "is no folder: give the one that a run wrote", {"folder": "run"}),
-    (gone("run/map.npz"), "holds no finished run: it lacks map.npz; run it to its end", fetched("run/map.npz")),
+    (gone("run/map.npz"), "holds no finished run: it lacks map.npz; run it to its end"),
 ]
 
 
@@ -478,7 +478,7 @@ FREE = {"port": 8123}
 OF_VIEW = [
     ({}, r"is taken by another program, .* such as port=(\d+)$", {"port": "{1}"}),
     ({"folder": "walk"} | FREE, "give the one that a run wrote, with metrics.json in it", {"folder": "run"}),
-    ((gone("run/trajectory.txt"), FREE), "lacks trajectory.txt; run it to its end", fetched("run/trajectory.txt")),
+    ((gone("run/trajectory.txt"), FREE), "lacks trajectory.txt; run it to its end"),
 ]
 TABLES = {
     "map": (write_mapped, read_mapped, OF_MAP),
