@@ -1,5 +1,6 @@
 """Settings that are mapped and scored together on one sequence, for `sweep` and `tune`."""
 
+import contextlib
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
@@ -17,7 +19,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
 from emgs_jax.io.files import atomic_write, remove_temporaries
 from emgs_jax.mapping.batch import finish_together, map_together, programs
-from emgs_jax.mapping.run import MappingRun, new_run
+from emgs_jax.mapping.run import new_run
 from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
@@ -47,6 +49,17 @@ def refuse_other_maps(config: DictConfig, what: str) -> None:
     }.items():
         if config[key]:
             raise ValueError(f"{key}= is for run and evaluate: {what} {reason}")
+
+
+@contextlib.contextmanager
+def resumed() -> Iterator[Path]:
+    """The folder of a command, of which Ctrl-C says how it is gone on with."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    try:
+        yield folder
+    except KeyboardInterrupt:
+        print(f"what is done is in {folder}; the same command with hydra.run.dir={folder} goes on from there")
+        raise
 
 
 def shared_settings(config: DictConfig) -> dict[str, Any]:
@@ -172,15 +185,9 @@ def map_and_score(sequence: Measured, prior: Prior, chunk: Sequence[Variant], ba
     runs = finish_together(groups)
     densify = [variant.densify for variant in chunk]
     metrics = score_settings(runs, raw, densify, scorer, num_threads)
-    if sequence.has_pictures:
-        for variant, run in zip(chunk, runs, strict=True):
-            _draw(picture_path(sequence.folder, variant.setting), run)
+    for variant, run in zip(chunk, runs, strict=True) if sequence.has_pictures else ():
+        centers, path = center_cloud(run), picture_path(sequence.folder, variant.setting)
+        path.parent.mkdir(exist_ok=True)
+        with atomic_write(path) as handle:
+            thumbnail(centers.points, centers.colors, np.stack(run.poses)).save(handle, "JPEG", quality=85)
     return metrics
-
-
-def _draw(path: Path, run: MappingRun) -> None:
-    """Write the map from above."""
-    centers = center_cloud(run)
-    path.parent.mkdir(exist_ok=True)
-    with atomic_write(path) as handle:
-        thumbnail(centers.points, centers.colors, np.stack(run.poses)).save(handle, "JPEG", quality=85)

@@ -27,7 +27,7 @@ from emgs_jax.report.tuning import DEFAULT, SequenceResults, draw_trials, settin
 from .command import command
 from .grid import variant_of
 from .search import Space, ask, ends_of, front, open_study, own_setting, read_objectives, read_space, told
-from .together import Measured, refuse_other_maps
+from .together import Measured, refuse_other_maps, resumed
 
 Setting = Mapping[str, Any]
 
@@ -216,12 +216,8 @@ def _write_best(folder: Path, best: Mapping[int, Setting], lines: Mapping[str, s
 @command("tune")
 def main(config: DictConfig) -> None:
     """Search, and say where the results are."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    try:
+    with resumed() as folder:
         tune(list(HydraConfig.get().overrides.task), folder)
-    except KeyboardInterrupt:
-        print(f"what is done is in {folder}; the same command with hydra.run.dir={folder} goes on from there")
-        raise
     print(f"everything is in {folder}")
 
 

@@ -5,7 +5,6 @@ import socket
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
-from importlib.metadata import version
 from pathlib import Path
 from unittest import mock
 
@@ -28,11 +27,10 @@ from emgs_jax.back_end.state import BackEnd
 from emgs_jax.config.configure import compose
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.gaussian_map import new_map
-from emgs_jax.io.files import jsonable, write_json
+from emgs_jax.io.files import write_json
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.loop_closure.place_recognition import Database, add_keyframe
-from emgs_jax.report.provenance import RESULT_FORMAT, git_now, write_metrics
 from emgs_jax.report.results import METRICS_FILE, is_finished
 from experiments.evaluate import plan
 from experiments.export import export_run
@@ -58,6 +56,7 @@ from tests.advice import (
 from tests.back_end.test_back_end import ring, walked
 from tests.report.test_segmentation_table import moved_run, write_truth
 from tests.report.written_run import written_run
+from tests.scripts.test_evaluate import made_up
 from tests.scripts.test_score import SIMILARITY, room, write_system
 from tests.scripts.test_tables import ONE_COMMIT, written
 
@@ -134,11 +133,7 @@ def read_plan(root: Path, *words: str, **keys) -> int:
 
 
 def write_finished(root: Path) -> None:
-    settings = OmegaConf.to_container(compose("suite=smoke", f"out={root / OUT}", name="evaluate"), resolve=True)
-    for job in plan(settings):
-        config = OmegaConf.to_container(job.config, resolve=True)
-        content = {"provenance": {"format": RESULT_FORMAT, "config": jsonable(config)}}
-        put(str((job.folder / METRICS_FILE).relative_to(root)), json.dumps(content))(root, None)
+    read_evaluation(root, OUT)
 
 
 OTHER = {"overrides": "'[slam.em.noise=0.3]'"}
@@ -372,13 +367,6 @@ def read_evaluation(root: Path, out: str = "out", **keys) -> bool:
 
 
 FILES = "gate", "rounded", "write_gate"
-
-
-def made_up(config: DictConfig, folder: Path) -> None:
-    block = {"format": RESULT_FORMAT, "protocol": "p", "simulated": True, "git": git_now()}
-    block |= {"prior": {"name": "simulated"}, "data": {"name": "synthetic", "sequence": "room0"}}
-    block |= {"versions": {"emgs_jax": version("emgs_jax")}, "config": OmegaConf.to_container(config, resolve=True)}
-    write_metrics(folder / METRICS_FILE, {"trajectory/ate_sim3_m": 0.01, "provenance": block})
 
 
 def evaluated(**keys) -> Step:

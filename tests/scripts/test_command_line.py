@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -309,27 +310,14 @@ def test_a_name_with_any_signs_is_read_and_a_run_of_nothing_leaves_nothing(tmp_p
     assert "Traceback" not in done.stderr and not folder.exists()
 
 
-@pytest.mark.parametrize("word", ["terminated", "interrupted"])
-def test_an_interrupt_is_one_word_and_no_traceback(word, monkeypatch, capfd):
-    """In the imports of a command, as `emgs` hears them."""
-    number = {"terminated": signal.SIGTERM, "interrupted": signal.SIGINT}[word]
-    monkeypatch.setattr(os, "_exit", raises)
-    monkeypatch.setattr(sys, "argv", ["emgs", "run", "dataset=nowhere"])
-    monkeypatch.setattr("experiments.cli.import_module", lambda *_: os.kill(os.getpid(), number) or sum(range(10)))
-    with heard(), pytest.raises(SystemExit) as ended:
-        main()
-    assert (ended.value.code, capfd.readouterr().err) == (128 + number, f"{word}\n")
-
-
 class Going:
-    """An object that sends a signal while it goes."""
+    """An object that does something while it goes."""
 
-    def __init__(self, number: int) -> None:
-        self.number = number
+    def __init__(self, last: Callable[[], None]) -> None:
+        self.last = last
 
     def __del__(self) -> None:
-        os.kill(os.getpid(), self.number)
-        sum(range(10))  # the handler runs here
+        self.last()
 
 
 @contextlib.contextmanager
@@ -346,55 +334,80 @@ def raises(code: int) -> None:
     raise SystemExit(code)
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-@pytest.mark.parametrize("place", ["collector", "object", "program"])
-def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place, monkeypatch):
-    """Python prints what is raised in a callback of the collector, as JAX has one, and the run went on to its end."""
+WORDS = {signal.SIGTERM: "terminated\n", signal.SIGINT: "interrupted\n"}
 
+
+@pytest.mark.parametrize("number", WORDS)
+@pytest.mark.parametrize("place", ["collector", "object", "program", "imports"])
+def test_a_signal_ends_a_command_with_one_word_wherever_the_program_is(number, place, monkeypatch, capfd):
+    """Python prints what is raised in a callback of the collector, as JAX has one, and the run went on to its end."""
     sent = []
 
-    def callback(phase, info):
-        if phase == "start" and not sent:
+    def send(*_):
+        if not sent:
             sent.append(number)
             os.kill(os.getpid(), number)
-            sum(range(10))
+            sum(range(10))  # the handler runs here
 
-    before = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
+    before = [signal.getsignal(one) for one in WORDS]
     monkeypatch.setattr(os, "_exit", raises)
+    monkeypatch.setattr(sys, "argv", ["emgs", "run", "dataset=nowhere"])
+    monkeypatch.setattr("experiments.cli.import_module", send)
+    if place == "collector":
+        gc.callbacks.append(send)
     with heard(), pytest.raises(SystemExit) as ended, clear_interrupt():
         match place:
             case "collector":
-                gc.callbacks.append(callback)
                 while not sent:  # nothing happens while another thread collects
                     gc.collect()
             case "object":
-                Going(number)
+                Going(send)
             case "program":
-                os.kill(os.getpid(), number)
+                send()
+            case "imports":
+                main()
         threading.Event().wait(5)
-    gc.callbacks[:] = [one for one in gc.callbacks if one is not callback]
-    assert ended.value.code == code
-    assert [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)] == before
+    gc.callbacks[:] = [one for one in gc.callbacks if one is not send]
+    assert (ended.value.code, capfd.readouterr().err) == (128 + number, WORDS[number])
+    assert [signal.getsignal(one) for one in WORDS] == before
 
 
-THREADS = {  # which Python does not wait for as it ends, or does
-    "of SciPy, which are daemons": "tree = cKDTree(np.random.default_rng(0).random((400000, 3)))\n"
-    " os.write(1, b'begun\\n')\n while True: tree.query(tree.data + .01, workers=2)",
-    "that are waited for": "os.write(1, b'begun\\n')\n"
-    " thread = threading.Thread(target=time.sleep, args=(90,)); thread.start()\n"
-    " while True: thread.join(.1)",  # a signal just before one long wait is heard when that is over
+KEPT = """import atexit, os, threading, time, numpy as np
+from scipy.spatial import cKDTree
+from experiments.interrupt import clear_interrupt
+atexit.register(os.write, 1, b'Python ends')
+with clear_interrupt():
+ print('kept', end='')
+"""
+PROGRAMS = {  # with threads that Python does not wait for as it ends, or does; and one that has done its work
+    "daemons of SciPy": f"""{KEPT} tree = cKDTree(np.random.default_rng(0).random((400000, 3)))
+ os.write(1, b'begun\\n')
+ while True: tree.query(tree.data + .01, workers=2)
+""",
+    "threads that are waited for": f"""{KEPT} os.write(1, b'begun\\n')
+ thread = threading.Thread(target=time.sleep, args=(90,))
+ thread.start()
+ while True: thread.join(.1)  # a signal just before one long wait is heard when that is over
+""",
+    "an end": """import atexit, time
+from experiments.interrupt import clear_interrupt, end_clearly
+end_clearly()
+with clear_interrupt(): print('kept', end='')
+def end():
+ print('begun', flush=True)
+ for _ in range(900): time.sleep(.1)
+atexit.register(end)
+""",
 }
 
 
-@pytest.mark.parametrize("kind", THREADS)
-def test_an_interrupt_ends_the_program_whatever_its_threads_compute(kind):
-    """The kills found SIGSEGV, one time in fifty: Python ends, and what a thread computes with is gone before it."""
-    words = "import atexit, os, threading, time, numpy as np\nfrom scipy.spatial import cKDTree\n"
-    words += "from experiments.interrupt import clear_interrupt\natexit.register(os.write, 1, b'Python ends')\n"
-    words += f"with clear_interrupt():\n print('kept', end='')\n {THREADS[kind]}"  # in a buffer
-    with begun(words) as (process, first):
-        process.send_signal(signal.SIGINT)
-        assert (process.wait(60), process.stderr.read()) == (130, b"interrupted\n")
+@pytest.mark.parametrize(("kind", "number"), zip(PROGRAMS, [signal.SIGINT, signal.SIGINT, signal.SIGTERM], strict=True))
+def test_a_signal_ends_the_program_whatever_it_does(kind, number):
+    """The kills found SIGSEGV, one time in fifty: Python ends, and what a thread computes with is gone before it; and a
+    traceback of JAX's clean up, in a callback that Python calls as it ends."""
+    with begun(PROGRAMS[kind]) as (process, first):
+        process.send_signal(number)
+        assert (process.wait(60), process.stderr.read().decode()) == (128 + number, WORDS[number])
         assert first + process.stdout.read() in (b"keptbegun\n", b"begun\nkept")
 
 
@@ -408,16 +421,6 @@ def begun(program: str):
         first = process.stdout.readline()
         assert first.endswith(b"begun\n")
         yield process, first
-
-
-def test_a_signal_after_the_work_is_done_is_no_traceback():
-    """Found by the kills: SIGTERM while JAX cleaned up, in a callback that Python calls as it ends."""
-    words = "import atexit, time\nfrom experiments.interrupt import clear_interrupt, end_clearly\nend_clearly()\n"
-    words += "with clear_interrupt(): pass\ndef end():\n print('begun', flush=True)\n"
-    words += " for _ in range(900): time.sleep(.1)\n"  # one long sleep hears no signal that came just before it
-    with begun(words + "atexit.register(end)") as (process, _):
-        process.send_signal(signal.SIGTERM)
-        assert (process.wait(60), process.stderr.read()) == (143, b"terminated\n")
 
 
 def test_a_signal_while_a_command_imports_ends_it_with_a_word():

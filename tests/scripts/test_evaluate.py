@@ -13,14 +13,13 @@ import pytest
 import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.types import RunMode
-from omegaconf import OmegaConf
+from omegaconf import DictConfig, OmegaConf
 from tiny_run import CONF, TINY
 
 import experiments.evaluate
 from emgs_jax.config.configure import compose, groups
-from emgs_jax.io.files import write_json
 from emgs_jax.report.gate import read_gate
-from emgs_jax.report.provenance import RESULT_FORMAT, git_now
+from emgs_jax.report.provenance import RESULT_FORMAT, git_now, write_metrics
 from emgs_jax.report.results import METRICS_FILE
 from experiments.command import clear_errors
 
@@ -33,6 +32,15 @@ def composed(*words: str) -> dict:
 
 def jobs_of(*words: str) -> list:
     return list(experiments.evaluate.plan(composed(*words)))
+
+
+def made_up(config: DictConfig, folder: Path) -> None:
+    """A run that only writes what it is of: metrics, of a room and a seed."""
+    block = {"format": RESULT_FORMAT, "protocol": config.evaluation.protocol, "simulated": True} | THIS_CODE
+    block |= {"prior": {"name": "simulated"}, "config": OmegaConf.to_container(config, resolve=True)}
+    block["data"] = {"name": "synthetic", "sequence": f"room{config.dataset.seed}"}
+    ate = 0.01 * (1 + config.dataset.seed) + 0.001 * config.prior.seed
+    write_metrics(folder / METRICS_FILE, {"trajectory/ate_sim3_m": ate, "provenance": block})
 
 
 @pytest.fixture
@@ -48,11 +56,7 @@ def evaluate(tmp_path, monkeypatch):
         is_broken = config.dataset.seed in evaluation.broken
         if is_broken and config.dataset.seed not in evaluation.late:
             raise evaluation.broken[config.dataset.seed]
-        block = {"format": RESULT_FORMAT, "protocol": config.evaluation.protocol, "simulated": True} | THIS_CODE
-        block |= {"prior": {"name": "simulated"}, "config": OmegaConf.to_container(config, resolve=True)}
-        block["data"] = {"name": "synthetic", "sequence": f"room{config.dataset.seed}"}
-        ate = 0.01 * (1 + config.dataset.seed) + 0.001 * config.prior.seed
-        write_json(folder / METRICS_FILE, {"trajectory/ate_sim3_m": ate, "provenance": block})
+        made_up(config, folder)
         if is_broken:
             raise evaluation.broken[config.dataset.seed]
 
