@@ -18,10 +18,10 @@ from emgs_jax.config.configure import build, build_dataset, build_prior, compose
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.mapping.window_input import window_inputs
+from emgs_jax.report.finished_run import FinishedRun, read_run
 from emgs_jax.report.gathering import gather
 from emgs_jax.report.metrics import true_cloud
 from emgs_jax.report.overview import fill_holes, paint_from_above
-from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.repeat import repeat
 
 TARGET = Path(__file__).with_name("before_after.png")
@@ -42,7 +42,7 @@ class Panel(NamedTuple):
     points_m: float
 
 
-def before(run: RecordedRun, dataset, prior, config) -> Panel:
+def before(run: FinishedRun, dataset, prior, config) -> Panel:
     """What the prior says by itself."""
     views = (view for given in window_inputs(dataset, prior, build(config, "slam")) for view in given.raw)
     evaluation = build(config, "evaluation")
@@ -51,7 +51,7 @@ def before(run: RecordedRun, dataset, prior, config) -> Panel:
     return Panel("Before: the predictions as they come", cloud.points, cloud.colors, run.raw, *errors)
 
 
-def after(run: RecordedRun) -> Panel:
+def after(run: FinishedRun) -> Panel:
     """The dense points of the map."""
     rows = read_vertices(run.folder / "points.ply")
     points, colors = (np.stack([rows[name] for name in names], 1) for names in ("xyz", ("red", "green", "blue")))

@@ -11,7 +11,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import check_writable, new_folder, owned
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.export import IMAGE_FORMATS, ExportConfig, export, find_factor, write_scaled
-from emgs_jax.report.recorded_run import RecordedRun, read_run
+from emgs_jax.report.finished_run import FinishedRun, read_run
 from emgs_jax.report.run_images import images_of
 
 from .command import command, first_words
@@ -46,7 +46,7 @@ def export_run(config: DictConfig) -> list[Path]:
     return sorted(target.iterdir())
 
 
-def at_original_size(run: RecordedRun) -> tuple[RecordedRun, ReadableFrames]:
+def at_original_size(run: FinishedRun) -> tuple[FinishedRun, ReadableFrames]:
     """A run with its images in the size on disk, straightened, and their camera; ValueError where it names no size."""
     size = run.provenance["data"].get("camera", {}).get("size")
     settings = OmegaConf.create(dict(run.provenance["config"]))

@@ -5,9 +5,9 @@ from typing import Any
 
 from omegaconf import DictConfig
 
+from emgs_jax.report.finished_run import REPORT_FILE
 from emgs_jax.report.merging import merge
 from emgs_jax.report.printout import last_words, metrics_table
-from emgs_jax.report.recorded_run import REPORT_FILE
 
 from .command import command, first_words
 

@@ -16,6 +16,7 @@ from emgs_jax.data.class_file import read_classes
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.io.files import check_writable
 from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.report.finished_run import FinishedRun, read_run
 from emgs_jax.report.provenance import is_metric
 from emgs_jax.report.query import Question, ask, write_answer
 from emgs_jax.report.query_pictures import (
@@ -30,7 +31,6 @@ from emgs_jax.report.query_pictures import (
     save_labels,
     views_of,
 )
-from emgs_jax.report.recorded_run import RecordedRun, read_run
 from emgs_jax.report.vocabulary import Vocabulary, feature_model, vocabulary, words_of
 
 from .command import command
@@ -94,7 +94,7 @@ def rivals(config: DictConfig, words: tuple[str, ...], texts: Vocabulary) -> Tex
     return texts.embed(names) if names else TextEmbeddings((), texts.embed(words[:1]).vectors[:0], (), {})
 
 
-def given_views(config: DictConfig, run: RecordedRun) -> list[View] | None:
+def given_views(config: DictConfig, run: FinishedRun) -> list[View] | None:
     """The poses of `pose` or `frame`; None where the best ones are to be found."""
     if config.pose is not None and config.frame is not None:
         raise ValueError("pose and frame both say from where to draw: give one of them")
@@ -110,7 +110,7 @@ def given_views(config: DictConfig, run: RecordedRun) -> list[View] | None:
     return [View(f"pose at {time:g}", pose) for time, pose in zip(times, poses, strict=True)]
 
 
-def named_views(run: RecordedRun, views: list[View] | None) -> dict[str, View]:
+def named_views(run: FinishedRun, views: list[View] | None) -> dict[str, View]:
     """The poses that class images are drawn from: the given ones by their numbers, else all frames by their images."""
     if views is not None:
         return {f"{number:06d}": view for number, view in enumerate(views)}

@@ -5,8 +5,8 @@ from pathlib import Path
 from omegaconf import DictConfig
 
 from emgs_jax.io.files import check_writable
+from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.page import write_report
-from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.run_images import images_of
 
 from .command import command, first_words

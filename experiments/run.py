@@ -31,6 +31,7 @@ from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.back_end import revisit_note
 from emgs_jax.report.dense import center_cloud, dense_map
+from emgs_jax.report.finished_run import REPORT_FILE, read_run
 from emgs_jax.report.gathering import Baselines, RawPrior, gather
 from emgs_jax.report.labelling import labelled_map
 from emgs_jax.report.live import LiveView, live_view
@@ -45,11 +46,10 @@ from emgs_jax.report.metrics import (
     spent,
 )
 from emgs_jax.report.page import write_report
-from emgs_jax.report.polish import OPTAX, polish
 from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words
 from emgs_jax.report.provenance import is_metric, provenance, signature, write_metrics
-from emgs_jax.report.recorded_run import REPORT_FILE, read_run
 from emgs_jax.report.run_files import claim_folder, save_classes, save_outputs, save_progress
+from emgs_jax.report.run_splats import OPTAX, polish
 
 from .command import command
 from .shorthand import with_source
@@ -118,13 +118,13 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     write_metrics(folder / "metrics.json", metrics)
     keeper.drop()
     with clock.phase("report"):
-        recorded = read_run(folder)
+        finished = read_run(folder)
     if fitting is not None:
         tqdm.write("fitting splats to the images …")
         with clock.phase("polish"):
-            notes = [*notes, *polish_lines(polish(recorded, dataset, fitting, densify))]
+            notes = [*notes, *polish_lines(polish(finished, dataset, fitting, densify))]
     with _said(clock, "report", f"writing {REPORT_FILE}"):
-        write_report(recorded, dataset)
+        write_report(finished, dataset)
     if live is not None:
         notes = [*notes, f"the live view has ended; emgs view {folder} shows the finished run"]
     notes = [*notes, *revisit_note(session.back_end)]

@@ -12,7 +12,7 @@ from emgs_jax.config.configure import build
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.evaluation.segmentation import DistinctCells, LabelledPoints, label_cells, read_labelled_mesh, true_labels
 from emgs_jax.io.files import write_file, write_json
-from emgs_jax.report.recorded_run import RecordedRun, read_run
+from emgs_jax.report.finished_run import FinishedRun, read_run
 from emgs_jax.report.run_images import images_of
 from emgs_jax.report.segmentation_table import Placement, SceneResult, score_scene, summary, table
 from emgs_jax.report.vocabulary import feature_model, vocabulary
@@ -47,7 +47,7 @@ def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
     return found, said
 
 
-def scene_names(config: DictConfig, runs: list[RecordedRun]) -> list[str]:
+def scene_names(config: DictConfig, runs: list[FinishedRun]) -> list[str]:
     """Names of the scenes: those of `scenes`, else the sequences that were mapped."""
     if config.scenes is None:
         return [str(run.provenance["data"]["sequence"]) for run in runs]
@@ -57,7 +57,7 @@ def scene_names(config: DictConfig, runs: list[RecordedRun]) -> list[str]:
     return names
 
 
-def true_points(config: DictConfig, run: RecordedRun, scene: str) -> LabelledPoints:
+def true_points(config: DictConfig, run: FinishedRun, scene: str) -> LabelledPoints:
     """The truth of one scene: vertices of its mesh, or voxels that its labelled frames see."""
     if config.truth != FRAMES:
         if config.classes is None:

@@ -4,7 +4,7 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.viewer import Viewer
 from emgs_jax.report.viewer_scene import shown
 

@@ -22,10 +22,11 @@ from emgs_jax.mapping.atlas import with_state
 from emgs_jax.mapping.capacity import advance, start
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.event import Event
-from emgs_jax.mapping.integrate import lost_event, seconds_of, start_event, step_event, update_graph
+from emgs_jax.mapping.integrate import seconds_of, update_graph
 from emgs_jax.mapping.pipeline import finish_run, map_input, with_atlas
 from emgs_jax.mapping.records import records_of
 from emgs_jax.mapping.run import MappingRun
+from emgs_jax.mapping.tracking import lost_event, start_event, step_event
 from emgs_jax.mapping.window_input import RawView, WindowInput, window_inputs
 from emgs_jax.observation import Observation, Prediction
 from emgs_jax.ops.camera import Camera

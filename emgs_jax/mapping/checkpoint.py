@@ -21,10 +21,9 @@ from emgs_jax.io.npz import load_headed, save_headed
 from emgs_jax.io.structs import pack, unpack
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe
 from emgs_jax.loop_closure.verification import LoopMeasurement
-from emgs_jax.mapping.atlas import Atlas, Submap
+from emgs_jax.mapping.atlas import Atlas, Submap, World
 from emgs_jax.mapping.records import FrameRecord, with_moved_nodes
 from emgs_jax.mapping.run import MappingRun
-from emgs_jax.mapping.world import World
 from emgs_jax.motion import Looks
 from emgs_jax.observation import Observation
 from emgs_jax.ops.ranges import number
@@ -34,7 +33,7 @@ from emgs_jax.registration.pose_noise import Repeats
 from emgs_jax.slam import SlamState
 
 CHECKPOINT_FILE = "checkpoint.npz"
-FORMAT, VERSION = "emgs_jax.checkpoint", 8
+FORMAT, VERSION = "emgs_jax.checkpoint", 9
 OF_MAPS = (Submap, World, SlamState, GaussianMap, Gaussians, Observation, Looks, PoseEstimate, Repeats, jaxlie.SE3)
 OF_GRAPH = (BackEnd, Node, Factor, LoopMeasurement, Refusal, Closure, PoseGraphInfo, Database, Keyframe)
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from emgs_jax.slam import StepInfo
 
-# Outcomes of relocalization, `Event.location`; files have these words.
-RELOCALIZED, RESTARTED, NEW_SUBMAP, JOINED = "found", "anew", "segment", "joined"
+# Outcomes of relocalization, `Event.location`, as files have them.
+RELOCALIZED, RESTARTED, NEW_SUBMAP, JOINED = "relocalized", "restarted", "new_submap", "joined"
 
 
 @dataclass(frozen=True)

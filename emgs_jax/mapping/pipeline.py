@@ -6,10 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import replace
 
 from emgs_jax.data.base import Dataset
+from emgs_jax.device.clock import Timer
 from emgs_jax.mapping.atlas import Atlas, set_unjoined_apart
+from emgs_jax.mapping.capacity import prepare_step
 from emgs_jax.mapping.checkpoint import Keeper
+from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.finalize import rescale_atlas, with_first_frame
-from emgs_jax.mapping.integrate import finish_back_end, integrate
+from emgs_jax.mapping.integrate import finish_back_end, integrate, seconds_of
 from emgs_jax.mapping.records import FrameRecord, records_of, with_moved_nodes, with_unjoined_apart
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.mapping.window_input import RawView, WindowInput, make_prior_query, window_inputs
@@ -69,6 +72,10 @@ def not_found_message(run: MappingRun) -> str:
 
 def map_input(run: MappingRun, window: WindowInput) -> tuple[MappingRun, Sequence[FrameRecord]]:
     """Integrate one input into a run, and write its log; return it, and the new records as first estimated."""
+    if isinstance(window.prediction, FirstWindow):
+        timer = Timer(run.clock)
+        prepare_step(window.prediction.views, run.camera, run.config)
+        window = replace(window, seconds=seconds_of(window, timer))
     atlas, event = integrate(run.atlas, window, run.prior_query, run.clock)
     records = records_of(window, event)
     return with_atlas(replace(run, records=(*run.records, *records)), atlas), records

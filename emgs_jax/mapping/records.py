@@ -61,9 +61,9 @@ class FrameRecord:
         status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
             initialization (the map was made from it), apart (a submap holds it that was never joined with the map) or
             skipped (it cannot be read).
-        location: outcome of relocalization: `found`, and the run continues from there; `anew`, and the map restarts
-            from its coarse pose; or the reason of the failure. `segment`: a disconnected submap starts; `joined`: this
-            frame connects it.
+        location: outcome of relocalization: `relocalized`, and the run continues from there; `restarted`, and the map
+            does so from its coarse pose; or the reason of the failure. `new_submap`: a disconnected submap starts;
+            `joined`: this frame connects it.
         pose: T_world_camera; of a lost frame what stands in for it.
         raw_pose: the same by the raw prediction; that of the frame before where it has none.
         true_pose: None where unknown.

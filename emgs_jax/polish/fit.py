@@ -176,7 +176,9 @@ def fit(
     return state.fitted, views._replace(poses=placed(views, state.offsets), gains=gains)
 
 
-def locate(anchors: Anchors, fitted: Appearance, views: Views, camera: Camera, config: PolishConfig) -> np.ndarray:
+def place_on_splats(
+    anchors: Anchors, fitted: Appearance, views: Views, camera: Camera, config: PolishConfig
+) -> np.ndarray:
     """Place frames on splats that stay as they are; returns T_world_camera of each, (m, 4, 4)."""
     import optax  # an extra
 

@@ -240,7 +240,7 @@ def _along_ray(distance: Float[Array, "p"], T: jaxlie.SE3, matches: Matches, pro
     return jnp.log(jnp.maximum(1.0 + distance / depth, LEAST_RATIO)) / std
 
 
-def data_information(
+def information_of_rows(
     y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig
 ) -> Float[Array, "7 7"]:
     """J'J of the points' rows by (xi, log s) about y; 0 for the scale where it is no unknown."""
@@ -250,7 +250,7 @@ def data_information(
     return jacobian.T @ jacobian
 
 
-def information(
+def information_of_surface(
     T: jaxlie.SE3, scale: Float[Array, ""], matches: Matches, problem: Problem, config: IcpConfig
 ) -> Float[Array, "6 6"]:
     """Compute the inliers' information about xi by planes and colours: w Σ j j' with j = (a, x × a) / std.

@@ -20,8 +20,8 @@ from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.ranges import number
 from emgs_jax.report.colors import OURS, STATUS_COLORS, rgb
+from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.report.moving import moving_mask
-from emgs_jax.report.recorded_run import RecordedRun
 
 POINTS_FILE = "points.ply"
 FORMATS = {"colmap": "colmap", "nerfstudio": "nerfstudio", "frustums": "cameras.ply"}  # and what is written
@@ -49,7 +49,7 @@ class ExportConfig:
     moving: str = field(default="kept", metadata={"choices": ("kept", "masked")})
 
 
-def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
+def export(run: FinishedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
     """Write a run into `folder`, which is there, in the run's unit; returns what was written.
 
     Args:
@@ -77,7 +77,7 @@ def export(run: RecordedRun, folder: Path, config: ExportConfig, dataset: Readab
     return [folder / FORMATS[name] for name in config.formats]
 
 
-def find_factor(run: RecordedRun, config: ExportConfig) -> float | None:
+def find_factor(run: FinishedRun, config: ExportConfig) -> float | None:
     """Return the factor on all lengths of a run, from `scale` or `length`; None if neither is given."""
     if config.length is None:
         return config.scale
@@ -86,7 +86,7 @@ def find_factor(run: RecordedRun, config: ExportConfig) -> float | None:
     return factor_of(run, config.length)
 
 
-def _colmap(run: RecordedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig) -> None:
+def _colmap(run: FinishedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig) -> None:
     """Write a project folder: images/, sparse/0/, and masks/ by COLMAP's names."""
     with new_folder(folder) as new:
         names = _write_images(new / "images", run, dataset)
@@ -97,7 +97,7 @@ def _colmap(run: RecordedRun, folder: Path, dataset: ReadableFrames, config: Exp
         save_colmap(model, run.camera, names, run.poses[run.is_placed], *_cloud(run, config.max_points))
 
 
-def _nerfstudio(run: RecordedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig) -> None:
+def _nerfstudio(run: FinishedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig) -> None:
     """Write images/, masks/, points.ply and transforms.json."""
     with new_folder(folder) as new:
         names, masks = _write_images(new / "images", run, dataset), []
@@ -111,14 +111,14 @@ def _nerfstudio(run: RecordedRun, folder: Path, dataset: ReadableFrames, config:
         save_transforms(new / "transforms.json", run.camera, files, run.poses[run.is_placed], POINTS_FILE, masks)
 
 
-def _frustums(run: RecordedRun, path: Path) -> None:
+def _frustums(run: FinishedRun, path: Path) -> None:
     """Write a pyramid for every frame in the colour of its status; the path is cut where the camera was lost."""
     colors = np.array([rgb(STATUS_COLORS.get(frame["status"], OURS)) for frame in run.frames])
     is_joined = run.is_placed[1:] & run.is_placed[:-1]
     save_frustums(path, run.camera, run.poses, colors, is_joined, rgb(OURS))
 
 
-def _write_images(folder: Path, run: RecordedRun, dataset: ReadableFrames) -> list[str]:
+def _write_images(folder: Path, run: FinishedRun, dataset: ReadableFrames) -> list[str]:
     """Write the images of the placed frames, undistorted and in the run's size; returns their names.
 
     A name is the frame's number and has one dot: 3DGS cuts at the first one.
@@ -132,7 +132,7 @@ def _write_images(folder: Path, run: RecordedRun, dataset: ReadableFrames) -> li
     return names
 
 
-def _write_masks(folder: Path, run: RecordedRun, names: Sequence[str]) -> None:
+def _write_masks(folder: Path, run: FinishedRun, names: Sequence[str]) -> None:
     """Write masks of these names for the placed frames, black where something moves."""
     folder.mkdir()
     size = run.camera.width, run.camera.height
@@ -142,7 +142,7 @@ def _write_masks(folder: Path, run: RecordedRun, names: Sequence[str]) -> None:
             raise OSError(f"{folder / name} cannot be written: is the disk full?")
 
 
-def _cloud(run: RecordedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
+def _cloud(run: FinishedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
     """Draw at most so many points (p, 3) with colours (p, 3), uint8, of the dense cloud; the same ones every time."""
     columns = read_vertices(run.folder / POINTS_FILE)
     count = len(columns["x"])
@@ -153,7 +153,7 @@ def _cloud(run: RecordedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
     return points.astype(np.float64), colors
 
 
-def factor_of(run: RecordedRun, length: Sequence[float]) -> float:
+def factor_of(run: FinishedRun, length: Sequence[float]) -> float:
     """Find the factor that makes the distance between two cameras as long as it is known to be.
 
     Args:
@@ -177,7 +177,7 @@ def factor_of(run: RecordedRun, length: Sequence[float]) -> float:
     return length[2] / distance
 
 
-def write_scaled(run: RecordedRun, folder: Path, factor: float) -> RecordedRun:
+def write_scaled(run: FinishedRun, folder: Path, factor: float) -> FinishedRun:
     """Write trajectories, map.npz, clouds and scale.json into `folder`, which is there; returns the run in that unit.
 
     About the origin of the world, which stays. What the run does not have is left out; truth and features stay.

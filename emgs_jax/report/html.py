@@ -18,7 +18,7 @@ from PIL import Image
 
 from emgs_jax.io.files import write_file
 from emgs_jax.report.colors import STATUS_COLORS
-from emgs_jax.report.recorded_run import REPORT_FILE
+from emgs_jax.report.finished_run import REPORT_FILE
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 MAX_BYTES = 5_000_000

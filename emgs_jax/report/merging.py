@@ -23,10 +23,10 @@ from emgs_jax.mapping.records import FrameRecord, to_line, with_moved_nodes, wit
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.dense import DenseMap, center_cloud, dense_map
+from emgs_jax.report.finished_run import FRAMES_FILE, TEXT_FILE, FinishedRun, read_run
 from emgs_jax.report.metrics import Scorer, describe, score_back_end, score_map, true_cloud
 from emgs_jax.report.page import write_report
 from emgs_jax.report.provenance import git_now, write_metrics
-from emgs_jax.report.recorded_run import FRAMES_FILE, TEXT_FILE, RecordedRun, read_run
 from emgs_jax.report.repeat import repeat
 from emgs_jax.report.results import METRICS_FILE
 from emgs_jax.report.run_files import save_outputs, save_progress
@@ -35,15 +35,15 @@ OF_DATA = "name", "sequence"  # of a provenance's data
 
 
 @dataclass(frozen=True)
-class FinishedRun:
+class MergeableRun:
     """A finished run as it is merged: with a node for each of its records."""
 
-    recorded: RecordedRun
+    finished: FinishedRun
     atlas: Atlas
     records: tuple[FrameRecord, ...]
 
 
-def finished_run(folder: Path) -> FinishedRun:
+def mergeable(folder: Path) -> MergeableRun:
     """Read a finished run; raises ValueError where it has no keyframes by which its places are found."""
     run = read_run(folder)
     config = config_of(run)
@@ -57,10 +57,10 @@ def finished_run(folder: Path) -> FinishedRun:
     end, lost = with_records(end, records, run.online)
     slam = replace(slam, submap=replace(slam.submap, map_capacity=run.map.weight.shape[0]))
     known = unvisited(SavedMap(run.map, end, depth_noise, is_fixed=False, checksum=""), run.camera, slam)
-    return FinishedRun(run, with_lost(Atlas(run.camera, slam, end, {0: known}), lost), records)
+    return MergeableRun(run, with_lost(Atlas(run.camera, slam, end, {0: known}), lost), records)
 
 
-def config_of(run: RecordedRun) -> DictConfig:
+def config_of(run: FinishedRun) -> DictConfig:
     """The config of a run, with infinities, which metrics.json has not."""
     return compose(*repeat(run.provenance["config"]).words)
 
@@ -95,7 +95,7 @@ def with_records(end: BackEnd, records: Sequence[FrameRecord], online: np.ndarra
     return replace(end, nodes=(*end.nodes[:first], *known), first_node=first), lost
 
 
-def merged(runs: Sequence[FinishedRun], has_truth: bool) -> tuple[MappingRun, list[int], dict[int, str]]:
+def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, list[int], dict[int, str]]:
     """Join all runs with the first one, each where it shows places of it or of one that is joined already.
 
     Args:
@@ -120,9 +120,9 @@ def merged(runs: Sequence[FinishedRun], has_truth: bool) -> tuple[MappingRun, li
         pending.remove(number)
         reasons.pop(number, None)
     if len(order) == 1:
-        why = "; ".join(f"{runs[number].recorded.folder}: {reason}" for number, reason in reasons.items())
+        why = "; ".join(f"{runs[number].finished.folder}: {reason}" for number, reason in reasons.items())
         raise ValueError(
-            f"none of the runs can be joined with {runs[0].recorded.folder}, so there is no merged run: {why}"
+            f"none of the runs can be joined with {runs[0].finished.folder}, so there is no merged run: {why}"
         )
     for number in pending:
         atlas, order = beside(atlas, runs[number].atlas), [*order, number]
@@ -152,9 +152,9 @@ def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[d
     Returns:
         Its metrics; and what there is to say: which run was not joined and why, and what could not be made.
     """
-    read = [finished_run(folder) for folder in folders]
+    read = [mergeable(folder) for folder in folders]
     run, order, reasons = merged(read, has_truth)
-    parts = [read[number].recorded for number in order]
+    parts = [read[number].finished for number in order]
     origin, dataset, note = _origin(parts, has_truth)
     config = config_of(parts[0])
     densify, evaluation = replace(build(config, "densify"), points="map"), build(config, "evaluation")
@@ -178,11 +178,11 @@ def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[d
         metrics |= describe(run) | score_back_end(run) | {"provenance": origin}
         write_metrics(new / METRICS_FILE, metrics)
         write_report(read_run(new), dataset, note)
-    apart = [f"{read[n].recorded.folder} is not joined, and in submaps/ as it is: {why}" for n, why in reasons.items()]
+    apart = [f"{read[n].finished.folder} is not joined, and in submaps/ as it is: {why}" for n, why in reasons.items()]
     return metrics, [*apart, *notes, *filter(None, [note])]
 
 
-def _origin(parts: Sequence[RecordedRun], has_truth: bool) -> tuple[dict[str, Any], ReadableFrames | None, str]:
+def _origin(parts: Sequence[FinishedRun], has_truth: bool) -> tuple[dict[str, Any], ReadableFrames | None, str]:
     """Provenance of a merged run, its images, and why there are none."""
     first = parts[0].provenance
     settings = OmegaConf.to_container(OmegaConf.create(dict(first["config"])), resolve=True)
@@ -202,7 +202,7 @@ def _origin(parts: Sequence[RecordedRun], has_truth: bool) -> tuple[dict[str, An
     return first | origin | {"data": data | {"frames": {"size": size, "intrinsics": intrinsics}}}, dataset, note
 
 
-def _camera_of(run: RecordedRun) -> tuple[tuple[int, int], tuple[float, float, float, float]]:
+def _camera_of(run: FinishedRun) -> tuple[tuple[int, int], tuple[float, float, float, float]]:
     """Size and intrinsics of a run's images, to the last digit."""
     known = run.provenance["data"]["frames"]
     return tuple(known["size"]), tuple(known["intrinsics"])

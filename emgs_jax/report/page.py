@@ -15,12 +15,12 @@ from emgs_jax.io.files import jsonable
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report import page_words
 from emgs_jax.report.colors import NO_CLASS, PATHS, class_colors, rgb, to_bytes
+from emgs_jax.report.finished_run import SPLATS_FILE, FinishedRun, PlacedPaths, placed_paths, render_config
 from emgs_jax.report.html import MAX_BYTES, POLICY, jpeg, page, picture, source, write_page
 from emgs_jax.report.layers import COV_UNIT, feature_layer, fitted, layers_of, map_layers, packed, thinned
 from emgs_jax.report.overview import view_from_above
 from emgs_jax.report.page_pictures import Views, draw_views
 from emgs_jax.report.page_strip import key_of, strip
-from emgs_jax.report.recorded_run import SPLATS_FILE, PlacedPaths, RecordedRun, placed_paths, render_config
 from emgs_jax.report.repeat import repeat
 from emgs_jax.report.splats import owners, read_splats, splats_for_page
 
@@ -30,7 +30,7 @@ _MAX_PICTURES = 120  # frames, evenly spread
 _SCRIPTS = ("data.js", "vectors.js", "splats.js", "layers.js", "controls.js", "overlay.js", "frames.js", "main.js")
 
 
-def write_report(run: RecordedRun, dataset: Dataset | None, note: str = "") -> Path:
+def write_report(run: FinishedRun, dataset: Dataset | None, note: str = "") -> Path:
     """Write report.html into the folder of a run; the same run gives the same bytes.
 
     Args:
@@ -64,7 +64,7 @@ def _for_shader(config: RenderConfig) -> dict[str, float]:
     return {name: float(getattr(config, name)) for name in ("blur", "radius", "opacity")}
 
 
-def _splats(run: RecordedRun) -> tuple[dict[str, Any] | None, str, str, np.ndarray]:
+def _splats(run: FinishedRun) -> tuple[dict[str, Any] | None, str, str, np.ndarray]:
     """`splats_for_page` of what `emgs polish` wrote into the run; None without."""
     splats = read_splats(run.folder / SPLATS_FILE)
     if splats is None or not len(splats.means):
@@ -73,7 +73,7 @@ def _splats(run: RecordedRun) -> tuple[dict[str, Any] | None, str, str, np.ndarr
     return about | {"render": {"blur": 0.3, "radius": 3.0, "opacity": 1.0}}, *rest  # as 3DGS draws
 
 
-def _path_arrays(run: RecordedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
+def _path_arrays(run: FinishedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
     """Collect the upper three rows of poses (n, 12), float32, in the frame of the map; only what is known."""
     found = {"poses": run.poses, "online": run.online, "truth": paths.truth, "raw": paths.raw}
     return {
@@ -83,7 +83,7 @@ def _path_arrays(run: RecordedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
     }
 
 
-def _about(run: RecordedRun, layers: dict[str, np.ndarray]) -> dict[str, Any]:
+def _about(run: FinishedRun, layers: dict[str, np.ndarray]) -> dict[str, Any]:
     """Collect the data that the page's program needs, beside the attributes of Gaussians."""
     means = layers["mean"].astype(np.float64) if len(layers["mean"]) else run.poses[:, :3, 3]
     low, high = np.percentile(np.concatenate([means, run.poses[:, :3, 3]]), [1, 99], axis=0)
@@ -115,7 +115,7 @@ def _about(run: RecordedRun, layers: dict[str, np.ndarray]) -> dict[str, Any]:
 
 
 def _page(
-    run: RecordedRun,
+    run: FinishedRun,
     paths: PlacedPaths,
     views: Views,
     about: Mapping[str, Any],
@@ -158,7 +158,7 @@ def _page(
         step += 1
 
 
-def _overview(run: RecordedRun) -> Markup:
+def _overview(run: FinishedRun) -> Markup:
     """Show the picture of the run to who reads without a program."""
     path = run.folder / "overview.png"
     if not path.is_file():

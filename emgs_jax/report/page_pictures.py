@@ -18,9 +18,9 @@ from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.report.colors import to_bytes
 from emgs_jax.report.display import closed
+from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.report.html import jpeg
 from emgs_jax.report.moving import with_moving
-from emgs_jax.report.recorded_run import RecordedRun
 
 WIDTH = 200  # pixels; a picture is not wider
 _NO_DEPTH = (221, 221, 221)
@@ -49,7 +49,7 @@ def _drawn(gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: Rende
     return drawing.values, drawing.depth
 
 
-def draw_views(run: RecordedRun, rows: Sequence[int], config: RenderConfig, dataset: Dataset | None) -> Views:
+def draw_views(run: FinishedRun, rows: Sequence[int], config: RenderConfig, dataset: Dataset | None) -> Views:
     """Draw the map of a run by our own renderer from some frames, beside their images.
 
     Args:

@@ -6,9 +6,9 @@ from typing import NamedTuple
 import numpy as np
 
 from emgs_jax.report.colors import PATHS, STATUS_COLORS
+from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.report.page_words import loop_words
 from emgs_jax.report.provenance import has_metric_truth
-from emgs_jax.report.recorded_run import RecordedRun
 
 HEIGHT = 100.0  # units of a row's picture; one unit across is a frame
 ERRORS = {"raw": "raw prior", "online": "as placed", "ours": "ours"}
@@ -35,7 +35,7 @@ class Row(NamedTuple):
     shapes: Sequence[Shape]
 
 
-def strip(run: RecordedRun, errors: dict[str, np.ndarray]) -> list[Row]:
+def strip(run: FinishedRun, errors: dict[str, np.ndarray]) -> list[Row]:
     """Draw statuses, errors of positions [m] by name, numbers of the frames that there are, and loops."""
     ends = [f"{run.frames[0]['index']} – {run.frames[-1]['index']}"] if run.frames else []
     rows = [Row("frames", "", 20, ends, _statuses(run))]
@@ -60,19 +60,19 @@ def strip(run: RecordedRun, errors: dict[str, np.ndarray]) -> list[Row]:
     return [*rows, Row("loops", "", 60, [], _arcs(run))] if run.loops else rows
 
 
-def key_of(run: RecordedRun, errors: dict[str, np.ndarray]) -> list[tuple[str, str]]:
+def key_of(run: FinishedRun, errors: dict[str, np.ndarray]) -> list[tuple[str, str]]:
     """Pair colours with their meanings."""
     found = {line["status"] for line in run.frames}
     statuses = [(color, name) for name, color in STATUS_COLORS.items() if name in found]
     return statuses + [(_COLORS[name], ERRORS[name]) for name in ("ours", "raw", "online") if name in errors]
 
 
-def _numbers(run: RecordedRun, name: str) -> np.ndarray:
+def _numbers(run: FinishedRun, name: str) -> np.ndarray:
     values = [line.get(name) for line in run.frames]
     return np.array([value if isinstance(value, int | float) else np.nan for value in values], np.float64)
 
 
-def _statuses(run: RecordedRun) -> list[Shape]:
+def _statuses(run: FinishedRun) -> list[Shape]:
     """Draw runs of one status as one rectangle."""
     words = [line["status"] for line in run.frames]
     starts = [0, *(row for row in range(1, len(words)) if words[row] != words[row - 1])]
@@ -108,7 +108,7 @@ def _line(shares: np.ndarray) -> str:
     )
 
 
-def _arcs(run: RecordedRun) -> list[Shape]:
+def _arcs(run: FinishedRun) -> list[Shape]:
     """Draw a loop as an arc between its frames; only accepted ones are green."""
     shapes = []
     for loop in sorted(run.loops, key=lambda item: item["outcome"] == "accepted"):

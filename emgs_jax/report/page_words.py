@@ -8,10 +8,10 @@ from typing import Any, NamedTuple
 from emgs_jax.mapping.records import APART
 from emgs_jax.report import columns
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
+from emgs_jax.report.finished_run import POLISH, FinishedRun, sound
 from emgs_jax.report.html import Head, commit_words
 from emgs_jax.report.moving import MUCH
 from emgs_jax.report.provenance import RAW_PRIOR, in_unit, length_words, lines_of
-from emgs_jax.report.recorded_run import POLISH, RecordedRun, sound
 from emgs_jax.report.repeat import Repeated
 
 MANY_LOST = 0.1  # share of the frames
@@ -77,7 +77,7 @@ def loop_why(loop: dict[str, Any]) -> str:
     return f"{why}: {loop['reason']}" if loop.get("reason") else why
 
 
-def loop_words(run: RecordedRun, loop: dict[str, Any]) -> str:
+def loop_words(run: FinishedRun, loop: dict[str, Any]) -> str:
     """Name frames, by their index in the data set as everywhere on the page, outcome and reason."""
     frame, other = (run.frames[loop[name]]["index"] for name in ("frame", "other"))
     return f"frames {frame} and {other}: {loop_why(loop)}"
@@ -91,7 +91,7 @@ class Loops(NamedTuple):
     each: list[str]
 
 
-def verdict(run: RecordedRun) -> tuple[str, str]:
+def verdict(run: FinishedRun) -> tuple[str, str]:
     """Judge as `good`, `mixed`, `bad` or `unknown`, in one sentence; without ground truth by the tracking alone.
 
     Bad: more than a tenth of the frames is lost, or the path is worse than the raw prior's. Mixed: of the true depth
@@ -125,7 +125,7 @@ def verdict(run: RecordedRun) -> tuple[str, str]:
     return level, f"{words}; {tracked}."
 
 
-def head(run: RecordedRun, again: Repeated) -> Head:
+def head(run: FinishedRun, again: Repeated) -> Head:
     """Write the head of the page: data and prior, verdict, versions, and the command that repeats the run."""
     block, (level, words) = run.provenance, verdict(run)
     data, prior = block["data"], block["prior"]
@@ -139,7 +139,7 @@ def head(run: RecordedRun, again: Repeated) -> Head:
     return Head(window, title, beside, level, words, block["simulated"], remarks, again.command, sources)
 
 
-def errors(run: RecordedRun) -> Table | None:
+def errors(run: FinishedRun) -> Table | None:
     """Compare our errors, those as placed, of the raw prior and of baselines, one beside the other; None without."""
     metrics = run.metrics
     if not any(MAIN[0].key in key for key in metrics):
@@ -152,7 +152,7 @@ def errors(run: RecordedRun) -> Table | None:
     return columns.transposed(columns.metric_table([""], columns.known(all_columns, lines), lines))
 
 
-def protocol_words(run: RecordedRun) -> str:
+def protocol_words(run: FinishedRun) -> str:
     """Say how errors are measured."""
     config = run.provenance["config"].get("evaluation", {})
     statistic, num_frames = config.get("statistic", "mean"), run.metrics.get("trajectory/num_frames")
@@ -163,7 +163,7 @@ def protocol_words(run: RecordedRun) -> str:
     )
 
 
-def loops(run: RecordedRun) -> Loops | None:
+def loops(run: FinishedRun) -> Loops | None:
     """Count the outcomes of loop candidates with their reasons; None without a back end."""
     if not run.loops:
         return None
@@ -180,7 +180,7 @@ def settings(again: Repeated) -> Table:
     return Table(("setting", "here", "default"), rows)
 
 
-def polished(run: RecordedRun) -> tuple[Table, str] | None:
+def polished(run: FinishedRun) -> tuple[Table, str] | None:
     """Compare map and splats of `emgs polish` on the frames that it held out; None where it was not run."""
     path = run.folder / POLISH[1]
     if not path.is_file():
@@ -197,7 +197,7 @@ def polished(run: RecordedRun) -> tuple[Table, str] | None:
     return Table(("held-out frames", "map", "splats"), rows), words
 
 
-def files(run: RecordedRun) -> Table:
+def files(run: FinishedRun) -> Table:
     """List the files beside the page, with the programs that open them."""
     there = [(name, words) for name, words in FILES.items() if name == "report.html" or (run.folder / name).exists()]
     return Table(("file", "what it is; what opens it"), there)

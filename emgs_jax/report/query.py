@@ -26,7 +26,7 @@ from emgs_jax.io.npz import save_headed
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.report.colors import class_colors
-from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.semantics import Relevance, relevance
 
 QUERY_FILE, SEMANTIC_FILE, SEMANTIC_PLY = "query.json", "semantic.npz", "semantic.ply"
@@ -68,7 +68,7 @@ class Answer:
     reach: float
 
 
-def ask(run: RecordedRun, question: Question) -> Answer:
+def ask(run: FinishedRun, question: Question) -> Answer:
     """Ask the map of a run."""
     gaussians = confirmed(run.map)
     vectors = (jnp.asarray(text.vectors, jnp.float32) for text in (question.words, question.against))

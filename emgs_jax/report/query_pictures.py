@@ -21,8 +21,8 @@ from emgs_jax.io.files import write_file
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.report.colors import class_colors, save_figure
+from emgs_jax.report.finished_run import FinishedRun, render_config
 from emgs_jax.report.query import GREY, Answer, heat, hot, painted
-from emgs_jax.report.recorded_run import RecordedRun, render_config
 from emgs_jax.semantics import principal_colors
 
 QUERY_PICTURE, FEATURES_PICTURE = "query.png", "features.png"
@@ -48,7 +48,7 @@ def _drawn(
     return drawing.values, drawing.alpha
 
 
-def drawn(run: RecordedRun, gaussians: Gaussians, values: np.ndarray, view: View, camera: Camera) -> np.ndarray:
+def drawn(run: FinishedRun, gaussians: Gaussians, values: np.ndarray, view: View, camera: Camera) -> np.ndarray:
     """Draw values (n, v) of the Gaussians as an image (h, w, v); nan where the map shows nothing."""
     config, pose = render_config(run), to_se3(view.pose)
     values, alpha = jax.device_get(_drawn(gaussians, jnp.asarray(values, jnp.float32), pose, camera, config))
@@ -56,14 +56,14 @@ def drawn(run: RecordedRun, gaussians: Gaussians, values: np.ndarray, view: View
     return np.where(is_seen[..., None], values / np.where(is_seen, alpha, 1.0)[..., None], np.nan)
 
 
-def views_of(run: RecordedRun) -> list[View]:
+def views_of(run: FinishedRun) -> list[View]:
     """Choose poses of frames that are not lost, at most `MAX_POSES`, evenly spread."""
     rows = np.flatnonzero(run.is_placed)
     chosen = np.unique(np.linspace(0, len(rows) - 1, min(MAX_POSES, len(rows))).astype(int))
     return [View(f"frame {run.frames[row]['index']}", run.poses[row]) for row in rows[chosen]]
 
 
-def frame_view(run: RecordedRun, frame: int) -> View:
+def frame_view(run: FinishedRun, frame: int) -> View:
     """Return the pose of one frame; raises ValueError where the run has none."""
     known = [line["index"] for line in run.frames]
     if frame not in known:
@@ -71,7 +71,7 @@ def frame_view(run: RecordedRun, frame: int) -> View:
     return View(f"frame {frame}", run.poses[known.index(frame)])
 
 
-def best_views(run: RecordedRun, answer: Answer, count: int) -> list[list[View]]:
+def best_views(run: FinishedRun, answer: Answer, count: int) -> list[list[View]]:
     """Find for each word the poses from which most pixels answer it, best first; none where there is no answer."""
     camera = downscale(run.camera, -(-run.camera.width // SMALL_WIDTH))
     words = len(answer.question.words.names)
@@ -85,7 +85,7 @@ def best_views(run: RecordedRun, answer: Answer, count: int) -> list[list[View]]
     return [[views[row] for row in order[:count, word] if scores[row, word] > 0] for word in range(words)]
 
 
-def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Sequence[View]], max_words: int) -> int:
+def draw_answer(path: Path, run: FinishedRun, answer: Answer, views: Sequence[Sequence[View]], max_words: int) -> int:
     """Draw a line for each word and view: the map in its colours, the word's relevance, the classes with a legend.
 
     Returns:
@@ -105,7 +105,7 @@ def draw_answer(path: Path, run: RecordedRun, answer: Answer, views: Sequence[Se
     return sum(bool(views[word]) for word in words)
 
 
-def save_labels(folder: Path, run: RecordedRun, answer: Answer, views: Mapping[str, View]) -> None:
+def save_labels(folder: Path, run: FinishedRun, answer: Answer, views: Mapping[str, View]) -> None:
     """Write which word the map answers with at each pixel, as class images that `features.folder` and others read.
 
     NAME.png holds 16-bit ids, 1 for the first word and so on, 0 where the map shows nothing or none of the words;
@@ -119,7 +119,7 @@ def save_labels(folder: Path, run: RecordedRun, answer: Answer, views: Mapping[s
     write_file(folder / CLASSES_FILE, "".join(f"{number} {name}\n" for number, name in enumerate(names, start=1)))
 
 
-def label_image(run: RecordedRun, answer: Answer, view: View) -> np.ndarray:
+def label_image(run: FinishedRun, answer: Answer, view: View) -> np.ndarray:
     """Draw the word (h, w) with the largest share of each pixel, from 1; 0 where that is none of them, or nothing."""
     labels, count = answer.relevance.labels + 1, len(answer.question.words.names) + 1
     best, found = np.zeros((run.camera.height, run.camera.width)), np.zeros((run.camera.height, run.camera.width), int)
@@ -131,7 +131,7 @@ def label_image(run: RecordedRun, answer: Answer, view: View) -> np.ndarray:
     return found
 
 
-def draw_features(path: Path, run: RecordedRun, views: Sequence[View]) -> None:
+def draw_features(path: Path, run: FinishedRun, views: Sequence[View]) -> None:
     """Draw the map's features as colours, see `principal_colors`, beside its own colours."""
     gaussians = confirmed(run.map)
     layers = np.concatenate([np.asarray(gaussians.colors), np.asarray(_colors(gaussians))], axis=1)

@@ -29,8 +29,8 @@ from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import loop_list, metric_graph
 from emgs_jax.report.dense import DenseMap, center_cloud
 from emgs_jax.report.display import closing_covariances
+from emgs_jax.report.finished_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, POLISH, REPORT_FILE, TEXT_FILE
 from emgs_jax.report.layers import feature_colors
-from emgs_jax.report.recorded_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, POLISH, REPORT_FILE, TEXT_FILE
 from emgs_jax.slam import SlamState
 
 # metrics.json first: it is what makes a folder a finished result.

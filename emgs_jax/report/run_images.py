@@ -9,11 +9,11 @@ from omegaconf.errors import OmegaConfBaseException
 from emgs_jax.config.configure import build_dataset, message_of
 from emgs_jax.data.joined import JoinedFrames
 from emgs_jax.data.readable import ReadableFrames
-from emgs_jax.report.recorded_run import RecordedRun, read_run
+from emgs_jax.report.finished_run import FinishedRun, read_run
 from emgs_jax.report.repeat import check_targets
 
 
-def images_of(run: RecordedRun) -> tuple[ReadableFrames | None, str]:
+def images_of(run: FinishedRun) -> tuple[ReadableFrames | None, str]:
     """The data set of a run, or why there is none; raises ValueError where settings name other code than ours."""
     settings, count = run.provenance["config"], len(run.poses)
     check_targets(settings["dataset"])

@@ -16,7 +16,7 @@ from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.geometry import Sim3
 from emgs_jax.report.columns import DASH, Table, cell, markdown
-from emgs_jax.report.recorded_run import RecordedRun
+from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.semantics import similarities
 
 FORMAT, VERSION = "emgs_jax.segmentation", 1
@@ -60,7 +60,7 @@ class SceneResult:
     ate_m: float | None
 
 
-def place(run: RecordedRun, truth: np.ndarray, how: Placement) -> tuple[np.ndarray, dict[str, Any]]:
+def place(run: FinishedRun, truth: np.ndarray, how: Placement) -> tuple[np.ndarray, dict[str, Any]]:
     """Move the confirmed Gaussians' centres (n, 3) to the frame of true points (m, 3); says how, too.
 
     Raises:
@@ -83,7 +83,7 @@ def place(run: RecordedRun, truth: np.ndarray, how: Placement) -> tuple[np.ndarr
 
 
 def score_scene(
-    run: RecordedRun,
+    run: FinishedRun,
     scene: str,
     truth: LabelledPoints,
     vectors: np.ndarray,

@@ -11,9 +11,9 @@ from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report.colors import OURS, PATHS, STATUS_COLORS, rgb, to_bytes
+from emgs_jax.report.finished_run import SPLATS_FILE, FinishedRun, placed_paths, render_config
 from emgs_jax.report.layers import covariances, feature_layer, map_layers
 from emgs_jax.report.overview import view_from_above
-from emgs_jax.report.recorded_run import SPLATS_FILE, RecordedRun, placed_paths, render_config
 from emgs_jax.report.splats import Splats, owners, read_splats
 
 MAX_FRUSTUMS = 300  # more are a carpet; the chosen frame has its own
@@ -51,7 +51,7 @@ class Shown:
         return np.array([frame["status"] not in UNPLACED for frame in self.frames], bool)
 
 
-def shown(run: RecordedRun) -> Shown:
+def shown(run: FinishedRun) -> Shown:
     """Show a finished run; raises ValueError where its parts do not fit each other."""
     layers, names = map_layers(run.map, run.text) | feature_layer(run.map), () if run.text is None else run.text.names
     truth = placed_paths(run).truth[:, :3, 3]

@@ -11,7 +11,7 @@ from omegaconf import DictConfig
 from emgs_jax.config.configure import build
 from emgs_jax.features.base import FeatureModel
 from emgs_jax.features.text import TextEmbeddings, load_text
-from emgs_jax.report.recorded_run import TEXT_FILE, RecordedRun
+from emgs_jax.report.finished_run import TEXT_FILE, FinishedRun
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ class Vocabulary:
         return TextEmbeddings(names, vectors, self.known.templates, self.known.model)
 
 
-def feature_space(run: RecordedRun) -> dict[str, Any]:
+def feature_space(run: FinishedRun) -> dict[str, Any]:
     """Identify the model whose features a run's map holds; {"prior": name} for those of a prior without a model."""
     settings = run.provenance["prior"]["settings"]
     features = settings.get("features") if isinstance(settings, Mapping) else None
@@ -61,7 +61,7 @@ def feature_space(run: RecordedRun) -> dict[str, Any]:
     return dict(run.text.model) if run.text is not None else {"prior": run.provenance["prior"]["name"]}
 
 
-def vocabulary(run: RecordedRun, file: str | None, model: FeatureModel | None) -> Vocabulary:
+def vocabulary(run: FinishedRun, file: str | None, model: FeatureModel | None) -> Vocabulary:
     """Choose the vocabulary for a run's map: of the file if given, else of the model, else the run's classes.
 
     Raises:

@@ -32,11 +32,10 @@ from emgs_jax.loop_closure.place_recognition import Database, Keyframe
 from emgs_jax.loop_closure.prior_query import JointPrediction
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.mapping import integrate
-from emgs_jax.mapping.atlas import Atlas, Submap
+from emgs_jax.mapping.atlas import Atlas, Submap, World
 from emgs_jax.mapping.event import Event
 from emgs_jax.mapping.integrate import finish_back_end, update_graph
 from emgs_jax.mapping.window_input import WindowInput
-from emgs_jax.mapping.world import World
 from emgs_jax.pose_graph.deform import DeformConfig
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph, residuals
 from emgs_jax.registration.pose_estimate import exact_estimate

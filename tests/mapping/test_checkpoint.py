@@ -23,8 +23,8 @@ from emgs_jax.back_end.state import BackEnd, Node, Refusal
 from emgs_jax.gaussian_map import empty_map
 from emgs_jax.io.files import changes
 from emgs_jax.io.trajectory import load_trajectory_tum
-from emgs_jax.mapping import integrate
-from emgs_jax.mapping.atlas import Atlas, Submap
+from emgs_jax.mapping import tracking
+from emgs_jax.mapping.atlas import Atlas, Submap, World
 from emgs_jax.mapping.checkpoint import (
     CHECKPOINT_FILE,
     Checkpoint,
@@ -34,7 +34,6 @@ from emgs_jax.mapping.checkpoint import (
     save_checkpoint,
 )
 from emgs_jax.mapping.records import FrameRecord
-from emgs_jax.mapping.world import World
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.slam import SlamState
 from tools.kills.folders import log_lines
@@ -53,7 +52,7 @@ class Stopped(BaseException):
 @contextlib.contextmanager
 def in_step(number: int, is_killed: bool, monkeypatch):
     """At this step; who is killed writes nothing any more."""
-    steps, advance = itertools.count(), integrate.advance
+    steps, advance = itertools.count(), tracking.advance
 
     def counted(*arguments):
         if next(steps) == number:
@@ -63,7 +62,7 @@ def in_step(number: int, is_killed: bool, monkeypatch):
         return advance(*arguments)
 
     with monkeypatch.context() as patch, pytest.raises(Stopped):
-        patch.setattr(integrate, "advance", counted)
+        patch.setattr(tracking, "advance", counted)
         yield
 
 
@@ -98,9 +97,9 @@ def whole(*more):
 
 def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) -> None:
     """The same command takes so many steps, and comes to what the run that nobody stopped has."""
-    steps, advance = [], integrate.advance
+    steps, advance = [], tracking.advance
     with monkeypatch.context() as patch:
-        patch.setattr(integrate, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
+        patch.setattr(tracking, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
         found = experiments.run.run(compose(*OVERRIDES, *more), folder)
     assert len(steps) in num_steps, "the steps before are not repeated"
     expected, metrics = whole(*more)
@@ -164,8 +163,8 @@ def test_a_scheduler_ends_a_run_with_one_word_and_the_same_command_goes_on(tmp_p
     assert ended(program) == 128 + signal.SIGTERM, said.read_text()
     assert "terminated\n" in said.read_text() and "Traceback" not in said.read_text()
     assert f"the same command with hydra.run.dir={folder} goes on" in said.read_text()
-    steps, advance = [], integrate.advance
-    monkeypatch.setattr(integrate, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
+    steps, advance = [], tracking.advance
+    monkeypatch.setattr(tracking, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
     experiments.run.run(compose(*OVERRIDES), folder)
     assert len(steps) < NUM_FRAMES - 1, "in another process"
     for name in ("map.npz", "trajectory.txt"):

@@ -40,10 +40,10 @@ def test_a_camera_that_was_carried_off_comes_back():
     assert all(record.location is None for record in run.records[:back])
     lost = [record.status for record in run.records[first:back]]
     assert set(lost) <= {"degraded", "lost"}, "nothing leads from the frames before to these"
-    assert [record.location for record in run.records[back:]] == ["found", None, None]
+    assert [record.location for record in run.records[back:]] == ["relocalized", None, None]
     assert [record.status for record in run.records[back:]] == ["tracked"] * 3
     assert_near(run.records[back:])
-    assert score_back_end(run)["location/found"] == 1
+    assert score_back_end(run)["location/relocalized"] == 1
     end = run.back_end
     assert end.connected_since == back and not end.nodes[first].is_placed
     assert not any(edge.a >= end.connected_since > edge.b and edge.b >= first for edge in end.factors), (
@@ -67,7 +67,7 @@ def test_the_map_goes_on_where_the_prior_leads_when_the_camera_is_found_nowhere(
     run = mapped(frames, Misled(prior_of(frames), cut), words=NOWHERE)
     anew = cut + 3
     assert [record.status for record in run.records[cut:anew]] == ["degraded"] * 3
-    assert [record.location for record in run.records[anew:]] == ["anew"] + [None] * 4
+    assert [record.location for record in run.records[anew:]] == ["restarted"] + [None] * 4
     first = run.records[anew]
     assert first.status == "initialization" and first.new > 0 and first.reason is not None
     assert [record.status for record in run.records[anew + 1 :]] == ["tracked"] * 4
@@ -87,7 +87,7 @@ def test_nothing_begins_anew_where_nothing_leads():
     frames = walk((*THERE[:5], *range(1, 17, 2)))
     run = mapped(frames, Blinded(prior_of(frames), 5), words=NOWHERE)
     assert {record.status for record in run.records[5:]} <= {"degraded", "lost"}
-    assert "anew" not in {record.location for record in run.records}
+    assert "restarted" not in {record.location for record in run.records}
 
 
 @pytest.mark.long
@@ -96,7 +96,7 @@ def test_a_run_that_is_stopped_after_it_came_back_has_the_same_bits(tmp_path):
     keep = lambda: Keeper(tmp_path / "checkpoint.npz", CheckpointConfig(every=1000), {})  # noqa: E731
     prior = Blinded(prior_of(frames), len(THERE))
     stopped = mapped(frames, prior, keeper=keep(), stop=len(THERE) + patience + 1)
-    assert len(stopped.records) < len(frames) and "found" in [record.location for record in stopped.records]
+    assert len(stopped.records) < len(frames) and "relocalized" in [record.location for record in stopped.records]
     keeper = keep()
     assert keeper.found is not None
     same_run(mapped(frames, prior, keeper=keeper), kidnapped())
@@ -135,7 +135,7 @@ def test_a_prior_that_goes_on_in_a_frame_of_its_own_is_located_in_a_saved_map_th
 def test_frames_are_located_in_a_saved_map_and_it_stays_as_it_is(folder):
     frames = walk(BACK)
     run = mapped(frames, prior_of(frames, "prior.seed=7"), loaded(folder, "localize"))
-    assert run.records[0].location == "found" and {record.status for record in run.records} == {"tracked"}
+    assert run.records[0].location == "relocalized" and {record.status for record in run.records} == {"tracked"}
     assert_near(run.records)
     assert_only_located(run, folder)
 
@@ -145,7 +145,9 @@ def test_a_run_goes_on_in_a_saved_map_and_can_be_saved_itself(folder, tmp_path):
     run = mapped(frames, prior_of(frames, "prior.seed=7"), loaded(folder, "extend"))
     end = run.back_end
     assert (
-        run.records[0].location == "found" and len(end.poses) == len(THERE) + len(BACK) and end.first_node == len(THERE)
+        run.records[0].location == "relocalized"
+        and len(end.poses) == len(THERE) + len(BACK)
+        and end.first_node == len(THERE)
     )
     assert_near(run.records)
     assert int(run.state.time) == len(end.poses)

@@ -10,8 +10,8 @@ from scene import on_host, pose
 
 from emgs_jax.back_end.state import BackEnd
 from emgs_jax.geometry import seen_from
-from emgs_jax.mapping.integrate import covariance_of_map
 from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.mapping.tracking import covariance_of_map
 from tools.nees.consistency import nees, pose_errors
 
 COUNT, NUM_DRAWS = 12, 4000

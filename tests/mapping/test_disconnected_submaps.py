@@ -45,9 +45,9 @@ def test_parts_of_other_frames_and_units_are_joined_where_they_meet_the_map():
     """The last part is joined with the first, so it moves; then both meet the second, so that one moves."""
     run = apart(WHOLE, STARTS)
     end, said = run.back_end, [record.location for record in run.records]
-    assert [row for row, location in enumerate(said) if location == "segment"] == list(STARTS)
+    assert [row for row, location in enumerate(said) if location == "new_submap"] == list(STARTS)
     one, other = (row for row, location in enumerate(said) if location == "joined")
-    assert STARTS[1] < one < other and "anew" not in said, "the prior knows the motion from 0 to 78"
+    assert STARTS[1] < one < other and "restarted" not in said, "the prior knows the motion from 0 to 78"
     for node, record in zip(end.nodes, run.records, strict=True):
         for found in (node.pose, node.online, record.pose):
             distance, turn = pose_difference(found, record.true_pose)
@@ -57,7 +57,7 @@ def test_parts_of_other_frames_and_units_are_joined_where_they_meet_the_map():
     np.testing.assert_allclose(Sim3.from_matrix(run.records[other].similarity).scale, UNITS[1], rtol=0.02)
     assert not run.apart and {node.submap for node in end.nodes} == {0}
     metrics = score_back_end(run)
-    assert metrics["location/segment"] == metrics["location/joined"] == 2
+    assert metrics["location/new_submap"] == metrics["location/joined"] == 2
 
 
 @pytest.mark.slow
@@ -137,7 +137,7 @@ def test_a_world_that_comes_back_goes_on_in_its_submap():
     numbers = (*PARTS[0], *PARTS[1], 10, 12, 14, 16)
     frames, is_first = walk(numbers), [row not in range(5, 10) for row in range(len(numbers))]
     run = mapped(frames, Visited(prior_of(frames), (5, 10), UNITS), words=(NEVER_FOUND,))
-    assert [row for row, record in enumerate(run.records) if record.location == "segment"] == [5]
+    assert [row for row, record in enumerate(run.records) if record.location == "new_submap"] == [5]
     assert [record.status == APART for record in run.records] == [not first for first in is_first]
     for row in np.flatnonzero(is_first):
         distance, turn = pose_difference(run.records[row].pose, run.records[row].true_pose)

@@ -15,7 +15,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
-from emgs_jax.mapping import integrate
+from emgs_jax.mapping import pipeline
 from emgs_jax.mapping.pipeline import finish_run, map_frames
 from emgs_jax.mapping.run import new_run
 from emgs_jax.mapping.window_input import predictions, window_inputs
@@ -181,7 +181,7 @@ def test_features_without_a_grid_for_each_dense_view_are_refused():
 @pytest.mark.slow
 def test_the_merged_initialization_makes_the_map_from_the_whole_window(monkeypatch):
     """Only the first window: `initialization` is static, so a step would be compiled anew."""
-    monkeypatch.setattr(integrate, "prepare_step", lambda *_: None)  # of a step, which there is not
+    monkeypatch.setattr(pipeline, "prepare_step", lambda *_: None)  # of a step, which there is not
     frames = ReadableFrames(hydra.utils.instantiate(compose(f"dataset.stop={WINDOW_SIZE}").dataset))
     session, maps = map_tiny(frames, EditedPrior(), "slam.initialization=merged")
     assert [record.status for record in session.records] == ["initialization"] * WINDOW_SIZE

@@ -18,10 +18,18 @@ from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.localization import localize_coarse
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
-from emgs_jax.mapping.atlas import Atlas, Submap, rejection, relocalized_start, unvisited, with_state
-from emgs_jax.mapping.integrate import is_relocalization_due, is_restart_due
+from emgs_jax.mapping.atlas import Atlas, Submap, World, unvisited, with_state
 from emgs_jax.mapping.run import new_run
-from emgs_jax.mapping.world import World, anchor_motion, anchor_world, as_step_prediction, move_prediction
+from emgs_jax.mapping.tracking import (
+    anchor_motion,
+    anchor_world,
+    as_step_prediction,
+    is_relocalization_due,
+    is_restart_due,
+    move_prediction,
+    rejection,
+    relocalized_start,
+)
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.pose_estimate import exact_estimate

@@ -20,12 +20,12 @@ from emgs_jax.config import configure
 from emgs_jax.config.configure import build
 from emgs_jax.data.spool import Spool
 from emgs_jax.ops.camera import Camera
-from emgs_jax.polish.fit import Rates, Views, fit, is_held_out, locate
+from emgs_jax.polish.fit import Rates, Views, fit, is_held_out, place_on_splats
 from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, Shot, draw, gaussians_of, initial, loss, ssim
-from emgs_jax.report.polish import polish, target_of
+from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.printout import polish_lines
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.run_splats import polish, target_of
 from experiments.polish import polish_run
 from experiments.run import run
 
@@ -140,7 +140,7 @@ def test_poses_that_are_off_find_back_to_where_the_images_were_taken(tmp_path):
     # Where the splats are in the images: along a flat wall a turn and a shift nearly do the same.
     pixels = [
         pixels_of(anchors, poses)
-        for poses in (POSES, off, found.poses, locate(anchors, fitted, views, CAMERA, settings))
+        for poses in (POSES, off, found.poses, place_on_splats(anchors, fitted, views, CAMERA, settings))
     ]
     before, *after = (np.sqrt(np.mean((p - pixels[0]) ** 2)) for p in pixels[1:])
     assert before > 0.3 and max(after) < 0.2 * before

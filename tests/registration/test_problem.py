@@ -22,8 +22,8 @@ from emgs_jax.registration.problem import (
     pose_problem,
 )
 
-data_information, rows_of = on_host(problems.data_information), on_host(problems.rows_of)
-pose_information = on_host(problems.information)
+information_of_rows, rows_of = on_host(problems.information_of_rows), on_host(problems.rows_of)
+pose_information = on_host(problems.information_of_surface)
 jacobian_of = on_host(jax.jacfwd(problems.rows_of))
 NOWHERE = np.zeros(7, np.float32)
 DISTRIBUTION, STD, DEPTH_NOISE = 1, 0.01, 0.03
@@ -90,7 +90,7 @@ def test_the_information_of_the_points_is_that_of_their_rows_whatever_the_unit_o
     settings = at(config("slam/localization=default").localization.icp, "residual", DISTRIBUTION)
     matches, problem = noisy_problem()
     found, small, still = (
-        data_information(NOWHERE, matches, eqx.tree_at(lambda p: p.units, problem, device(units)), settings)
+        information_of_rows(NOWHERE, matches, eqx.tree_at(lambda p: p.units, problem, device(units)), settings)
         for units in (np.ones(7), np.array([3.0] * 3 + [1.0] * 3 + [0.01]), np.append(np.ones(6), 0.0))
     )
     jacobian = jacobian_of(NOWHERE, matches, problem, settings).astype(float).reshape(-1, 7)  # its unit is 1

@@ -15,7 +15,7 @@ from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.render.composite import render
 from emgs_jax.render.densify import densify
 from emgs_jax.report.display import LARGEST, closing_covariances
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.finished_run import read_run
 
 
 def read_gaussians(path) -> Gaussians:

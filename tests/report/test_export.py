@@ -21,7 +21,7 @@ from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.export import ExportConfig, export
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.finished_run import read_run
 from experiments.export import export_run
 
 ALL = ExportConfig(("colmap", "nerfstudio", "frustums"), 40, None, None)

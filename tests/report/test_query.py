@@ -23,9 +23,9 @@ from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.io.map_file import load_map, save_map
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.report.colors import class_colors
+from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.query import Question, ask, heat
 from emgs_jax.report.query_pictures import MAX_LEGEND, drawn, frame_view, legend, save_labels
-from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.vocabulary import vocabulary
 from experiments.query import asked, given_views, named_views, query, rivals
 

@@ -18,7 +18,7 @@ from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.ply_reader import read_vertices, scale_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.report.export import factor_of, write_scaled
-from emgs_jax.report.recorded_run import read_run
+from emgs_jax.report.finished_run import read_run
 from experiments.export import export_run
 
 FACTOR = 1.7

@@ -18,8 +18,8 @@ from emgs_jax.config import configure
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.display import closing_covariances
+from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.layers import covariances, map_layers, painted
-from emgs_jax.report.recorded_run import read_run
 from emgs_jax.report.viewer import HOST, Viewer
 from emgs_jax.report.viewer_answers import ask, find_words, highlighted, picked
 from emgs_jax.report.viewer_scene import field_of_view, shown

@@ -57,8 +57,8 @@ from emgs_jax.prior.base import windows
 from emgs_jax.prior.files.prior import Files
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.simulated.prior import Simulated
+from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.page import write_report
-from emgs_jax.report.recorded_run import read_run
 from tests.data.written_benchmarks import write_euroc, write_kitti
 from tests.data.written_scene import color_image, plane_depth, scene_pose, write_depth
 

@@ -25,12 +25,12 @@ from emgs_jax.io.packages import extra
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.ops.camera import Camera
-from emgs_jax.polish.fit import PolishConfig, Views, fit, is_held_out, locate, with_room, without_transparent
+from emgs_jax.polish.fit import PolishConfig, Views, fit, is_held_out, place_on_splats, with_room, without_transparent
 from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, gaussians_of, relative_gain, ssim
 from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
-from emgs_jax.report.recorded_run import POLISH, SPLATS_FILE, RecordedRun
+from emgs_jax.report.finished_run import POLISH, SPLATS_FILE, FinishedRun
 from emgs_jax.report.splats import owners
 from emgs_jax.semantics import classify
 
@@ -44,7 +44,7 @@ _ssim, _gain = jax.jit(ssim), jax.jit(relative_gain)
 
 
 def polish(
-    run: RecordedRun, dataset: ReadableFrames, config: PolishConfig, densify_config: DensifyConfig
+    run: FinishedRun, dataset: ReadableFrames, config: PolishConfig, densify_config: DensifyConfig
 ) -> dict[str, Any]:
     """Fit splats to all placed frames but the held-out ones; write them, and how the held-out ones look before, after.
 
@@ -97,7 +97,7 @@ def polish(
         for row in held:
             targets.append(target_of(*seen(row)))
         views = Views(targets, run.poses[held], _spreads(run, held, config), all_gains[held])
-        poses[held] = locate(anchors, fitted, views, run.camera, config)
+        poses[held] = place_on_splats(anchors, fitted, views, run.camera, config)
         save_trajectory_tum(run.folder / PATH_FILE, [line["timestamp"] for line in run.frames], poses)
     splats, opacity = gaussians_of(anchors, fitted)
     count = _save_splats(run, splats, opacity, nearest)
@@ -108,7 +108,7 @@ def polish(
 
 
 def _fitted(
-    anchors: Anchors, colors: np.ndarray, views: Views, run: RecordedRun, config: PolishConfig
+    anchors: Anchors, colors: np.ndarray, views: Views, run: FinishedRun, config: PolishConfig
 ) -> tuple[Appearance, Views]:
     """`fit` with a progress bar."""
     with Bar(total=config.steps, desc="polishing", unit="step", doing=compiling) as bar:
@@ -127,7 +127,7 @@ def _between(gains: np.ndarray, rows: list[int], count: int) -> np.ndarray:
     return np.stack([np.interp(np.arange(count), rows, channel) for channel in gains.T], axis=1)
 
 
-def _save_splats(run: RecordedRun, splats: Gaussians, opacity: jax.Array, nearest: Nearest) -> int:
+def _save_splats(run: FinishedRun, splats: Gaussians, opacity: jax.Array, nearest: Nearest) -> int:
     """Write splats.ply, with the class of the nearest Gaussian where the map has classes; returns how many."""
     gaussians, labels, classes = confirmed(run.map), None, ()
     if run.text is not None and gaussians.features.shape[-1]:
@@ -143,7 +143,7 @@ def target_of(image: np.ndarray, view: DenseView) -> np.ndarray:
     return np.concatenate([image, np.where(has_depth, view.depth, 0.0)[..., None]], axis=-1).astype(np.float16)
 
 
-def _spreads(run: RecordedRun, rows: list[int], config: PolishConfig) -> np.ndarray:
+def _spreads(run: FinishedRun, rows: list[int], config: PolishConfig) -> np.ndarray:
     """Square roots of the covariances of frames (m, 6, 6); 0 where poses stay.
 
     A frame without one, as the first, to which the others' are relative, has that of the nearest frame with one.
@@ -186,7 +186,7 @@ def _picture(*arguments: Any) -> tuple[Rendering, int]:
 
 
 def _compare(
-    run: RecordedRun, dataset: ReadableFrames, held: list[int], seen: Callable[[int], Seen], drawn: tuple
+    run: FinishedRun, dataset: ReadableFrames, held: list[int], seen: Callable[[int], Seen], drawn: tuple
 ) -> dict[str, Any]:
     """PSNR and SSIM over the pixels that the map covers, depth errors and ATE where the truth is known.
 

@@ -54,7 +54,7 @@ _OUTCOMES = ("accepted", "known", "unconfirmed", "unsolved", "refused")
 
 
 @dataclass(frozen=True)
-class RecordedRun:
+class FinishedRun:
     """Outputs of a finished run, as read from its folder.
 
     Args:
@@ -101,7 +101,7 @@ class RecordedRun:
         return is_metric(self.provenance["prior"]["settings"])
 
 
-def read_run(folder: Path) -> RecordedRun:
+def read_run(folder: Path) -> FinishedRun:
     """Read the folder of a finished run.
 
     Raises:
@@ -125,7 +125,7 @@ def read_run(folder: Path) -> RecordedRun:
             "or one was cut off; run again"
         )
     raw, truth = (_poses(folder / FRAMES_FILE, frames, name) for name in _POSES)
-    return RecordedRun(
+    return FinishedRun(
         folder=folder,
         metrics=metrics,
         frames=frames,
@@ -215,7 +215,7 @@ def _loops(path: Path, count: int) -> list[dict[str, Any]]:
     return loops
 
 
-def render_config(run: RecordedRun) -> RenderConfig:
+def render_config(run: FinishedRun) -> RenderConfig:
     """Read how the run drew its map; raises ValueError for settings of another version."""
     settings = {key: value for key, value in run.provenance["config"]["densify"]["render"].items() if key != "_target_"}
     with sound(f"{run.folder}/{METRICS_FILE} has settings of another version"):
@@ -232,7 +232,7 @@ class PlacedPaths(NamedTuple):
     errors: dict[str, np.ndarray]
 
 
-def placed_paths(run: RecordedRun) -> PlacedPaths:
+def placed_paths(run: FinishedRun) -> PlacedPaths:
     """Move the true path and the raw prior's to where they fit our path best; what is left of the difference.
 
     Each path is placed on the true one by itself, as for its error in metrics.json. Without truth the raw prior's path
