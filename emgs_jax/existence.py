@@ -214,17 +214,30 @@ def nearest_duplicates(
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
 ) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
-    """The nearest other layer of every Gaussian, and whether it is that one's nearest, too.
+    """The nearest other layer of every Gaussian, and whether it is that one's nearest, too."""
+    partner, has_layer = nearest_layer(map, is_seen, is_seen, origins, depth_noise, config)
+    return partner, has_layer & has_layer[partner] & (partner[partner] == jnp.arange(partner.shape[0]))
+
+
+def nearest_layer(
+    map: GaussianMap,
+    is_asked: Bool[Array, "n"],
+    is_known: Bool[Array, "n"],
+    origins: Float[Array, "*#n 3"],
+    depth_noise: Float[Array, ""],
+    config: ExistenceConfig,
+) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
+    """The nearest other layer of every Gaussian asked, among the known ones, and whether there is one.
 
     The squared distance of the means is taken under Σ_a + Σ_b + ν²nn', where ν is the noise of the frame along the
     normal n of the Gaussian itself: a frame cannot tell the two apart. Where one stands behind the other, by more
     than `MIN_GAP` standard deviations of either, they may be two sheets of one surface that different frames made, each
     with its own error. Then it is taken under ν² (1 / W_a + 1 / W_b), what the means of so many frames differ by.
     """
-    gaussians, count = map.gaussians, is_seen.shape[0]
-    groups = group_points(gaussians.means, is_seen)
-    order = order_of(groups, count)
-    rows, found = nearest(gaussians.means, is_seen, gaussians.means, groups, config.num_neighbours, order=order)
+    gaussians, count = map.gaussians, is_asked.shape[0]
+    groups = group_points(gaussians.means, is_known)
+    order = order_of(group_points(gaussians.means, is_asked), count)
+    rows, found = nearest(gaussians.means, is_asked, gaussians.means, groups, config.num_neighbours, order=order)
     noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - origins))
     covs, normals = lower_entries(gaussians.covs), jnp.unstack(gaussians.normals, axis=-1)
     frames = jnp.maximum(map.weight, 1.0)
@@ -247,14 +260,13 @@ def nearest_duplicates(
         near_features = gaussians.features[rows]
         has_both = has_feature(near_features) & has_feature(gaussians.features)
         is_alike &= ~has_both | (_inner(near_features, gaussians.features) > 0)
-        is_layer = found & is_seen & (rows != jnp.arange(count)) & is_one & is_alike
+        is_layer = found & is_asked & (rows != jnp.arange(count)) & is_one & is_alike
         return jnp.where(is_layer, distance_sq, jnp.inf)
 
     # In a loop, or XLA would do all of it again for everything that is asked of the distances.
     distance_sq = jax.lax.map(distance_to, (rows.T, found.T))
     partner = jnp.take_along_axis(rows, jnp.argmin(distance_sq, axis=0)[:, None], axis=1)[:, 0]
-    has_layer = jnp.min(distance_sq, axis=0) < jnp.inf
-    return partner, has_layer & has_layer[partner] & (partner[partner] == jnp.arange(count))
+    return partner, jnp.min(distance_sq, axis=0) < jnp.inf
 
 
 def _inner(first: Float[Array, "*b d"], second: Float[Array, "*#b d"]) -> Float[Array, "*b"]:

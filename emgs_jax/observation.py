@@ -14,6 +14,8 @@ from emgs_jax.ops.neighbours import is_within_reach
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, traced, where_rows
 
+ROUNDED_SQUARE = 2.0**-19  # of a unit quaternion's squared length, what it may be off by rounding
+
 
 class Observation(eqx.Module):
     """Points of one image, row by row in the order of its (thinned) pixels.
@@ -165,11 +167,18 @@ def sound(observation: Observation) -> Observation:
 
 
 def sound_poses(poses: jaxlie.SE3) -> jaxlie.SE3:
-    """The poses, NaN where one is beyond any map or its quaternion is no rotation's."""
+    """The poses, NaN where one is beyond any map or its quaternion is no rotation's.
+
+    A quaternion that is longer or shorter than by rounding becomes one of unit length: products of poses take that for
+    granted, and over many frames the lengths multiply.
+    """
     quaternion, translation = poses.wxyz_xyz[..., :4], poses.wxyz_xyz[..., 4:]
     length_sq = jnp.sum(quaternion**2, axis=-1)
-    is_sound = (jnp.abs(length_sq - 1.0) < 0.1) & is_within_reach(translation)
-    return jaxlie.SE3(jnp.where(is_sound[..., None], poses.wxyz_xyz, jnp.nan))
+    off = jnp.abs(length_sq - 1.0)
+    is_sound = (off < 0.1) & is_within_reach(translation)
+    length = jnp.sqrt(jnp.where(is_sound & (off > ROUNDED_SQUARE), length_sq, 1.0))
+    values = jnp.concatenate([quaternion / length[..., None], translation], axis=-1)
+    return jaxlie.SE3(jnp.where(is_sound[..., None], values, jnp.nan))
 
 
 def sound_covariances(covariances: Float[Array, "*b 6 6"]) -> Float[Array, "*b 6 6"]:

@@ -238,7 +238,7 @@ def _first_state(
     time = jnp.asarray(world.valid.shape[0], jnp.int32)
     new = new_map(gaussians, _first_weight(weight, config.em.average), existence, time - 1)
     map, _, overflow = insert(empty_map(config.submap.map_capacity, world.features.shape[-1]), new)
-    last, pose, looks = jax.tree.map(lambda leaf: leaf[-1], world), pose_row(T_world_views, -1), None
+    last, pose, looks = jax.tree.map(lambda leaf: leaf[-1], world), pose_row(sound_poses(T_world_views), -1), None
     if (before := no_looks(last, config.motion)) is not None:
         looks = look_again(before, last, jnp.zeros(last.valid.shape, bool), pose, pose, view)
     state = SlamState(map, last, pose, exact_estimate(), time, looks)

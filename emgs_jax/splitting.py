@@ -87,7 +87,7 @@ def halves(map: GaussianMap, min_std: Float[Array, ""]) -> tuple[GaussianMap, Ga
     axes = jnp.einsum("nda,na->nd", basis, axes)
     along = jnp.einsum("nij,nj->ni", shape, axes)
     variance = jnp.sum(along * axes, axis=-1)
-    step = along / jnp.sqrt(jnp.maximum(variance, jnp.finfo(jnp.float32).tiny))[:, None]
+    step = along / jnp.sqrt(jnp.where(variance > jnp.finfo(jnp.float32).tiny, variance, 1.0))[:, None]
     covs = gaussians.covs - 2 / jnp.pi * outer(step)
 
     def half(sign: float) -> GaussianMap:

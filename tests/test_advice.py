@@ -646,7 +646,7 @@ OF_CLASSES = [
             ("[wall]", "a.yaml is no class file .it is no mapping"),
             ("class_names_reduced: [wall]", "it lacks map_to_reduced"),
             ("class_names_reduced: [wall]\nmap_to_reduced: {1: 2}", "says 1: 2, and there are 1 classes"),
-            ("class_names_reduced: wall\nmap_to_reduced: {}", "expected a list, got str"),
+            ("class_names_reduced: wall\nmap_to_reduced: {}", "class_names_reduced is no list"),
             ("class_names_reduced: [3]\nmap_to_reduced: {}", "3 is no name"),
             ("a: [", "a.yaml is no class file"),
         )

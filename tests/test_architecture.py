@@ -17,7 +17,7 @@ FILES = sorted(PACKAGE.rglob("*.py"))
 CORE_ROOMS = (
     *("ops", "observation", "gaussians", "gaussian_map", "registration", "pose_graph", "render"),
     *("initialization", "localization", "em", "surface_extrapolation", "splitting", "refinement", "existence"),
-    *("motion", "semantics", "slam"),
+    *("layers", "motion", "semantics", "slam"),
 )
 # What is solved between frames, by SciPy; the core does not import it.
 HOST_FILES = {"pose_graph.sparse", "pose_graph.chordal", "pose_graph.problem", "pose_graph.optimize"}

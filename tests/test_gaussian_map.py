@@ -190,13 +190,15 @@ def test_fresh_gaussians_fill_the_free_rows_in_order():
 
 
 @pytest.mark.parametrize(
-    ("holes", "overflow"), [([2], 4), ([], 5), ([1, 4], 3), ([0, 1, 4, 6, 9], 0), (range(10), 0)], ids=str
+    ("holes", "num_new", "overflow"),
+    [([2], 5, 4), ([], 5, 5), ([1, 4], 5, 3), ([0, 1, 4, 6, 9], 5, 0), (range(10), 5, 0), (range(10), 12, 2)],
+    ids=str,
 )
-def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, overflow):
+def test_what_finds_no_free_row_is_counted_and_the_rest_is_kept(holes, num_new, overflow):
     map = with_holes([*holes])
-    inserted, count, lost = inserted_rows(map, sc.random_gaussians(5, 9))
-    assert (count, lost) == (5 - overflow, overflow)
-    assert inserted.gaussians.valid.sum() == 10 - len(holes) + min(5, len(holes))
+    inserted, count, lost = inserted_rows(map, sc.random_gaussians(num_new, 9))
+    assert (count, lost) == (num_new - overflow, overflow)
+    assert inserted.gaussians.valid.sum() == 10 - len(holes) + min(num_new, len(holes))
     kept = np.setdiff1d(np.arange(10), holes)
     sc.assert_same(sc.rows_of(inserted, kept), sc.rows_of(map, kept))
 
@@ -213,6 +215,7 @@ def test_growing_keeps_every_row_and_adds_free_neutral_ones():
     grown = grow(map, 16)
     sc.assert_same(sc.rows_of(grown, slice(8)), map)
     sc.assert_same(sc.rows_of(grown, slice(8, None)), empty_map(8, 0))
+    assert not (grown.weight[8:].any() or grown.existence[8:].any() or grown.gaussians.valid[8:].any())
 
 
 def test_a_similarity_keeps_what_a_map_says_of_every_point():

@@ -80,6 +80,7 @@ CASES = {
     "a block before it": (DRIFTED[:12], with_block(1.2, wall=DRIFTED[12]), {}, BLOCK),
     "nearer by what depths err": ([WALL] * 5, with_block(2.9), {}, NOTHING),
     "a pose that is not known": ([WALL] * 5, HERE, {"std": 0.5}, NOTHING),
+    "nearer by what a turn of two degrees errs": ([WALL] * 5, with_block(2.8), {"std": 0.03}, NOTHING),
     "a noise that is not known": ([WALL] * 5, HERE, {"noise": 0.0}, NOTHING),
     "one look only": ([WALL], HERE, {}, NOTHING),
     "no look": ([], HERE, {}, NOTHING),

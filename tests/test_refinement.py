@@ -7,7 +7,7 @@ import scene as sc
 
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.refinement import average_candidates, refine
+from emgs_jax.refinement import refine
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
@@ -92,19 +92,6 @@ def test_a_candidate_that_is_not_on_the_surface_is_fresh_and_the_map_unchanged(s
     sc.assert_same(merged, map_of(discs(GRID)))
 
 
-def test_two_candidates_on_one_gaussian_count_as_much_as_the_better_of_them(settings, camera):
-    """Eq. 6: γ from the largest ω, here the cosines .8 and .6, and not from their sum; the average is by ω."""
-    old = discs((0, 0, 2.0), std=0.3)
-    new = discs([(0.02, 0.01, 2.01), (-0.02, 0.0, 2.02)], std=0.3, color=0.9)
-    new = sc.replace(new, features=[[0.8, 0.6], [0.6, -0.8]])
-    merged, _, info = run(settings, camera, new, old)
-    gamma, share = 0.8 / 1.8, np.array([0.8, 0.6]) / 1.4
-    assert info.num_merged == 2
-    np.testing.assert_allclose(merged.weight, gamma, atol=1e-6)
-    expected = (1 - gamma) * np.array([0, 0, 2]) + gamma * share @ np.array([[0.02, 0.01, 2.01], [-0.02, 0, 2.02]])
-    np.testing.assert_allclose(merged.gaussians.means[0], expected, atol=1e-6)  # roundings
-
-
 READINGS = {
     "printed": {"back_margin": np.inf, "max_mahalanobis_sq_2d": 4.6, "average.gain": 0.0},
     "default": {"back_margin": 0.1, "front_margin": 0.1, "max_splat_std": 3.0, "average.gain": 1.0},
@@ -178,13 +165,6 @@ def test_candidates_beside_a_depth_edge_do_not_move_what_is_before_them(settings
     paired = sc.changed(settings, max_mahalanobis_sq_2d=9.0, depth_condition=1.0, front_margin=0.1, back_margin=0.1)
     distance, num_merged = moved(paired)
     assert distance == 0 and num_merged > 0
-
-
-def test_pairs_whose_normals_differ_do_not_merge(settings, camera):
-    turned = sc.replace(discs((0.02, 0, 2.0)), normals=[[0.8, 0.0, -0.6]])
-    for least, expected in ((0.5, 1), (0.7, 0), (-np.inf, 1)):
-        _, _, info = run(sc.at(settings, "min_normal_cos", least), camera, turned)
-        assert info.num_merged == expected
 
 
 @pytest.mark.parametrize("missing", ["candidate", "map"])
@@ -275,15 +255,3 @@ def test_invalid_candidates_and_map_rows_change_nothing(settings, camera, poison
     sc.assert_same(wild[2], clean[2])
     sc.assert_same(sc.rows_of(wild[0], known), sc.rows_of(clean[0], known))
     sc.assert_same(sc.rows_of(wild[1], clean[1].valid), sc.rows_of(clean[1], clean[1].valid))
-
-
-def test_the_average_of_candidates_has_the_moments_of_their_mixture():
-    old = discs([(0, 0, 2.0), (5, 5, 5.0)])
-    candidates = discs([(0.1, 0, 2.0), (0.3, 0, 2.2), (1.0, 1, 1)])
-    weights = np.float32([[0.3], [0.1], [0.0]])
-    averaged = sc.on_host(average_candidates)(candidates, np.zeros((3, 1), np.int32), weights, old)
-    np.testing.assert_allclose(averaged.means[0], [0.15, 0, 2.05], atol=1e-6)
-    offset = np.array([0.2, 0, 0.2])
-    expected = np.asarray(candidates.covs, float)[0] + 0.75 * 0.25 * np.outer(offset, offset)
-    np.testing.assert_allclose(averaged.covs[0], expected, atol=1e-6)
-    sc.assert_same(sc.rows_of(averaged, 1), sc.rows_of(old, 1))

@@ -1,5 +1,8 @@
 """What one Gaussian cannot explain is cut in two, and only where a view comes near enough to show it."""
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scene import assert_same, at, device, explained, fresh_map, on_host, random_gaussians, replace, rows_of, shares_of
@@ -118,6 +121,16 @@ def test_it_is_cut_across_its_longer_axis_as_a_normal_distribution_is(settings):
     np.testing.assert_allclose(second.gaussians.means[0], [1 + mean, 2, 3], atol=1e-5)
     np.testing.assert_allclose(first.gaussians.means[0], [1 - mean, 2, 3], atol=1e-5)
     np.testing.assert_allclose(second.gaussians.covs[0], np.diag([variance + floor**2, 0.01, floor**2]), atol=1e-6)
+
+
+def test_halves_of_what_is_thinner_than_the_floor_have_finite_slopes(settings):
+    def total(covs):
+        return jnp.sum(
+            halves(eqx.tree_at(lambda m: m.gaussians.covs, one_disc(), covs), settings.min_std)[1].gaussians.means
+        )
+
+    thin = device(np.tile(0.25 * float(settings.min_std) ** 2 * np.eye(3), (2, 1, 1)))
+    assert np.isfinite(on_host(jax.grad(total))(thin)).all()
 
 
 def parted(map, points, settings, explained=None):

@@ -11,6 +11,7 @@ from emgs_jax import (
     gaussian_map,
     gaussians,
     initialization,
+    layers,
     localization,
     motion,
     semantics,
@@ -256,6 +257,10 @@ VERBS = {
             m, jnp.arange(32) % 3 > 0, T.translation(), ONE * 0.1, CONFIG.existence
         ),
         lambda s: (map_of(s), looking(s)),
+    ),
+    "one_layer": (
+        lambda m, o: layers.one_layer(m, jnp.arange(32) % 2 > 0, o, ONE * 0.1, CONFIG.existence),
+        lambda s: (map_of(s), map_of(s + 9).gaussians.means),
     ),
     "look_again": (
         lambda k, o, T: motion.look_again(k, o, jnp.asarray(ROWS % 5 == 0), T, sc.path_pose(1), CAMERA),

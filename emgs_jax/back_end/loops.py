@@ -35,8 +35,8 @@ def detect_loops(end: BackEnd, frame: FrameData) -> BackEnd:
     end = replace(end, database=add_keyframe(end.database, _keyframe(end, time, frame), config))
     row = len(end.database.keyframes) - 1
     for candidate in propose_candidates(end.database, row, config):
-        if _submap_id_of(end, candidate.row) == end.active:
-            end = _verify_candidate(end, row, candidate.row)
+        if _submap_id_of(end, candidate) == end.active:
+            end = _verify_candidate(end, row, candidate)
     return end
 
 
@@ -52,7 +52,7 @@ def detect_loops_between(end: BackEnd, submap_id: int) -> BackEnd:
     )
     for row in queries:
         for candidate in most_similar(end.database, end.database.keyframes[row], known, config.num_candidates, config):
-            end = _verify_candidate(end, row, candidate.row, is_free=True)
+            end = _verify_candidate(end, row, candidate, is_free=True)
     return end
 
 
@@ -93,7 +93,7 @@ def _most_similar_submap(end: BackEnd, query: Keyframe) -> int | None:
     others = [row for row in range(len(keyframes)) if _submap_id_of(end, row) != end.active]
     others = [row for row in others if end.nodes[keyframes[row].frame].is_placed]
     found = most_similar(end.database, query, others, 1, end.config.place_recognition)
-    return _submap_id_of(end, found[0].row) if found else None
+    return _submap_id_of(end, found[0]) if found else None
 
 
 def _submap_id_of(end: BackEnd, row: int) -> int:

@@ -8,11 +8,13 @@ import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from jaxtyping import Array, Float
 
 from emgs_jax.back_end.factors import loop_factor, stack_factors
 from emgs_jax.back_end.state import BackEnd, Closure
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.existence import ExistenceConfig, merge_all_duplicates
+from emgs_jax.layers import one_layer
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import take_rows
@@ -24,7 +26,7 @@ from emgs_jax.registration.pose_estimate import rescale_estimate
 from emgs_jax.slam import SlamState
 
 move_map, _move_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)  # a map is compiled for once
-_merge = eqx.filter_jit(merge_all_duplicates)
+_merge, _one_layer = eqx.filter_jit(merge_all_duplicates), eqx.filter_jit(one_layer)
 
 
 @full_precision
@@ -71,10 +73,29 @@ def deform_state(state: SlamState, before: Nodes, after: Nodes, min_std: float, 
     )
 
 
-def merge_duplicates_of_state(state: SlamState, nodes: Nodes, depth_noise: float, config: ExistenceConfig) -> SlamState:
+def merge_duplicates_of_state(state: SlamState, end: BackEnd, config: ExistenceConfig) -> SlamState:
     """Merge duplicate surfaces of the whole map, see `merge_all_duplicates`."""
-    origins = take_rows(nodes.T_world.translation(), state.map.birth)
-    return replace(state, map=_merge(state.map, origins, jnp.asarray(depth_noise, jnp.float32), config))
+    noise = depth_noise_of(end)
+    return state if noise is None else replace(state, map=_merge(state.map, _origins(end, state), noise, config))
+
+
+def one_layer_of_state(state: SlamState, end: BackEnd, is_other: Sequence[bool], config: ExistenceConfig) -> SlamState:
+    """Make one layer of what some nodes have made and of what the others have, see `one_layer`."""
+    noise, is_other = depth_noise_of(end), jnp.asarray(is_other)[state.map.birth]
+    if noise is None:
+        return state
+    return replace(state, map=_one_layer(state.map, is_other, _origins(end, state), noise, config))
+
+
+def depth_noise_of(end: BackEnd) -> Float[Array, ""] | None:
+    """Median ν of the nodes that were registered to the map; None where none was."""
+    noise = [node.depth_noise for node in end.nodes if node.is_placed and node.depth_noise is not None]
+    return jnp.asarray(np.median(noise), jnp.float32) if noise else None
+
+
+def _origins(end: BackEnd, state: SlamState) -> Float[Array, "n 3"]:
+    """Where the camera was by which each Gaussian was made, world frame."""
+    return take_rows(nodes_of(end, end.active).T_world.translation(), state.map.birth)
 
 
 def _moved_pose(T: jaxlie.SE3, before: Nodes, after: Nodes, row: int) -> jaxlie.SE3:

@@ -1,15 +1,15 @@
 """A furnished apartment to walk through, ray-cast: long walks, loops and what is easily mistaken for a loop."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from emgs_jax.data import furniture, reading, room
+from emgs_jax.data import furniture
 from emgs_jax.data.furnishing import at_wall, furnish
 from emgs_jax.data.furniture import Part, moved
 from emgs_jax.data.looks import copied, draw_looks
-from emgs_jax.data.movers import Doorway, Lane, build_movers
+from emgs_jax.data.movers import Doorway, Lane
 from emgs_jax.data.plan import (
     APART,
     BAY,
@@ -28,7 +28,6 @@ from emgs_jax.data.plan import (
     shell,
 )
 from emgs_jax.data.raycast import RayCast, Scene
-from emgs_jax.data.reading import Number
 from emgs_jax.data.walks import RADIUS, WALKS, carry, rounded, table_of
 
 AHEAD = 2.4  # m from the camera to the middle of the way that a person goes to and fro
@@ -38,48 +37,30 @@ CHAIR_AT = 0.3  # of the path: where a second lap, or the way back, comes by aga
 Copies = list[Float[np.ndarray, " 3"]]  # where the copies of a group of objects stand, from where it was built
 
 
+@dataclass(eq=False)
 class Apartment(RayCast):
-    """Six furnished rooms, a hall and a gallery, walked through at eye level: 7 cm a frame, less round a corner.
+    """Six furnished rooms, a hall and a gallery, walked through at eye level.
 
-    Args:
-        seed: rooms, furniture and colours, the same for every walk.
-        walk: two_laps through four rooms; figure_of_eight through a doorway; out_and_back, which sees everything from
-            the other side; twin_rooms, two that look alike; corridor, which looks the same every 3 m.
-        num_frames: images along the walk, which stays the same; None = 7 cm apart, some 280 to 560.
-        intrinsics: fx, fy, cx, cy at `size`; None = .82 times the width and the centre.
-        movers: how many things move, see `build_movers`.
+    Rooms, furniture and colours are the same for every walk of a seed. Without `num_frames` there are some 280 to 560,
+    7 cm apart, less round a corner.
     """
 
-    name = "apartment"
-    classes = (*room.CLASSES, "door", "bed", "plant")
-    version = 1
+    # two_laps through four rooms; figure_of_eight through a doorway; out_and_back, which sees everything from the other
+    # side; twin_rooms, two that look alike; corridor, which looks the same every 3 m
+    walk: str = "two_laps"
 
-    def __init__(
-        self,
-        seed: int = 0,
-        walk: str = "two_laps",
-        num_frames: int | None = None,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Sequence[int] = (320, 240),
-        intrinsics: Sequence[Number] | None = None,
-        movers: int = 0,
-    ) -> None:
-        if seed < 0 or movers < 0 or (num_frames is not None and num_frames < 1):
-            raise ValueError(
-                "dataset.seed must be 0 or more (dataset.movers likewise) and dataset.num_frames 1 or more, or null "
-                f"(7 cm from frame to frame), got {seed}, {movers}, {num_frames}"
-            )
-        if walk not in WALKS:
-            raise ValueError(f"dataset.walk must be one of {', '.join(WALKS)}, got {walk!r}")
-        sequence = f"apartment{seed}_{walk}"
-        of_plan, of_scene, of_walk = np.random.default_rng(seed).spawn(3)
+    name, version = "apartment", 1
+    classes = (*furniture.CLASSES, "door", "bed", "plant")
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.walk not in WALKS:
+            raise ValueError(f"dataset.walk must be one of {', '.join(WALKS)}, got {self.walk!r}")
+        of_plan, of_scene, of_walk = np.random.default_rng(self.seed).spawn(3)
         self.plan = draw_plan(of_plan)
-        poses = carry(WALKS[walk](self.plan), num_frames, of_walk)
-        numbers = reading.select(len(poses), start, stop, stride, f"{self.name} {sequence}")
-        things = build_movers(movers, lane_ahead(self.plan, poses[:, :2, 3]), np.random.default_rng((seed, 1)))
-        super().__init__(sequence, build_apartment(self.plan, of_scene), poses, numbers, size, intrinsics, things)
+        poses = carry(WALKS[self.walk](self.plan), self.num_frames, of_walk)
+        things = self._things(lane_ahead(self.plan, poses[:, :2, 3]))
+        self._show(f"apartment{self.seed}_{self.walk}", build_apartment(self.plan, of_scene), poses, things)
 
 
 def lane_ahead(plan: Plan, camera: Float[np.ndarray, "n 2"]) -> Lane:

@@ -18,29 +18,19 @@ class BadFrameError(ValueError):
 
 @dataclass(frozen=True)
 class Frame:
-    """One image and what is known about it; every array has the data set's `size`.
+    """One image and what is known about it; every array has the data set's `size`."""
 
-    Args:
-        index: position among the images in use, from 0 (after `start`, `stop`, `stride`).
-        timestamp: seconds of the data set, or the number or the time in the file name where it has none.
-        name: path of the image file, for messages.
-        image: RGB, uint8 (h, w, 3).
-        depth: camera-space z in metres, float32 (h, w), 0 = no value; None without ground truth.
-        T_world_camera: true pose of the colour camera, OpenCV axes, float64 (4, 4); None without ground truth.
-        labels: semantic class per pixel, int32 (h, w), -1 = none; None without labels.
-        moving: what each pixel shows: STAYS, MOVES or ELSEWHERE, uint8 (h, w); None where all stays.
-        mask: True where nothing of the image is used, bool (h, w); None without masks.
-    """
-
-    index: int
-    timestamp: float
-    name: str
-    image: np.ndarray
-    depth: np.ndarray | None = None
+    index: int  # position among the images in use, from 0 (after `start`, `stop`, `stride`)
+    timestamp: float  # seconds of the data set, or the number or the time in the file name where it has none
+    name: str  # path of the image file, for messages
+    image: np.ndarray  # RGB, uint8 (h, w, 3)
+    depth: np.ndarray | None = None  # camera-space z in metres, float32 (h, w), 0 = no value; None without ground truth
+    # true pose of the colour camera, OpenCV axes, float64 (4, 4); None without ground truth
     T_world_camera: np.ndarray | None = None
-    labels: np.ndarray | None = None
+    labels: np.ndarray | None = None  # semantic class per pixel, int32 (h, w), -1 = none; None without labels
+    # what each pixel shows: STAYS, MOVES or ELSEWHERE, uint8 (h, w); None where all stays
     moving: np.ndarray | None = None
-    mask: np.ndarray | None = None
+    mask: np.ndarray | None = None  # True where nothing of the image is used, bool (h, w); None without masks
 
     @property
     def static_depth(self) -> np.ndarray | None:
@@ -61,9 +51,8 @@ class Dataset(Protocol):
     sequence: str  # e.g. "redkitchen/seq-01"
     size: tuple[int, int]  # (width, height) of every frame
     intrinsics: tuple[float, float, float, float]  # fx, fy, cx, cy in pixels at `size`, pixel centres at integers
-    calibration: Mapping[str, Any] = MappingProxyType(
-        {}
-    )  # where `intrinsics` are from, plain values for metrics.json; `note` if worth a line
+    # where `intrinsics` are from, plain values for metrics.json; `note` if worth a line
+    calibration: Mapping[str, Any] = MappingProxyType({})
     full_intrinsics: tuple[float, float, float, float] | None = None  # of `full`; None where it is the frame's image
     classes: tuple[str, ...] = ()  # names of the labels; empty without semantics
     has_ground_truth: bool = False  # depth and poses are there

@@ -1,13 +1,12 @@
 """Bonn RGB-D Dynamic: TUM's layout, with a motion capture that follows markers on the sensor in axes of its own."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from emgs_jax.data.intrinsics import Given
 from emgs_jax.data.reading import Number
-from emgs_jax.data.tum import Calibrations, Tum
+from emgs_jax.data.tum import TumLayout
 
 # The authors' transforms: what they call T_g, their world from a point of the camera, is T_ROS^-1 T T_ROS T_M with the
 # markers' pose T of groundtruth.txt. T_M is no rigid motion but has a scale of 1.0593, by which depths fall short of
@@ -24,38 +23,15 @@ T_M = np.array(
 CALIBRATION = (542.822841, 542.576870, 315.593520, 237.756098), (0.039903, -0.099343, -0.000730, -0.000144, 0.0)
 
 
-class Bonn(Tum):
-    """One sequence of Bonn RGB-D Dynamic; what a list lacks is treated as in `Tum`.
+@dataclass(eq=False)
+class Bonn(TumLayout):
+    """One sequence of Bonn RGB-D Dynamic, such as "rgbd_bonn_balloon"; lengths are metres of the motion capture."""
 
-    Args:
-        sequence: "rgbd_bonn_balloon".
-        start, stop, stride: which of the images in rgb.txt, in order of time.
-        intrinsics: of the images on disk, as `Images` takes them; None = the benchmark's calibration.
-        depth_scale: raw units per metre of the motion capture.
-        max_time_difference: seconds between a colour image and its depth image or pose.
-    """
+    depth_scale: Number = 4720.1
 
     name = "bonn"
     source = "Bonn RGB-D Dynamic Dataset, project page of the Photogrammetry and Robotics Lab of the University of Bonn"
-    calibrations: Calibrations = {"": CALIBRATION}  # of one sensor, whatever the sequence is called
-
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | None = None,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 10,
-        size: Sequence[int] = (320, 240),
-        intrinsics: Given | None = None,
-        depth_scale: Number = 4720.1,
-        max_time_difference: Number = 0.02,
-    ) -> None:
-        super().__init__(
-            *(root, sequence, start, stop, stride, size, intrinsics),
-            depth_scale=depth_scale,
-            max_time_difference=max_time_difference,
-        )
+    calibrations = {"": CALIBRATION}  # of one sensor, whatever the sequence is called
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
         T_capture_markers = super().pose(index)

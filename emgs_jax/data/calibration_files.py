@@ -4,7 +4,7 @@ COLMAP and nerfstudio count from the image's corner, so .5 is taken off.
 """
 
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -138,18 +138,24 @@ def _lens(values: Mapping[str, Any], model: str, path: Path, before: str = "") -
     return lens_of(model, bent if model != "OPENCV" or bent[4] else bent[:4], path)
 
 
+def _camera(values: Mapping[str, Any], names: Sequence[str], path: Path, model="OPENCV", before="", corner=0.0):
+    """The camera whose fx, fy, cx, cy, width, height stand at `names`; the first pixel's centre is at `corner`."""
+    fx, fy, cx, cy, width, height = needed(values, names, path)
+    lens = _lens(values, model, path, before)
+    return Calibration((fx, fy, cx - corner, cy - corner), lens, size_of(width, height, path), model)
+
+
 def _transforms(values: Mapping[str, Any], path: Path) -> Calibration:
     """nerfstudio: one camera for all frames."""
-    camera = {"fl_x", "fl_y", "cx", "cy", "w", "h", *DISTORTION}
+    names = ("fl_x", "fl_y", "cx", "cy", "w", "h")
+    camera = {*names, *DISTORTION}
     values = with_frames_camera(values, camera | {"camera_model", "is_fisheye"}, path)
     values = with_angle_of_view(values, path)
     _check_known(values, camera | TRANSFORMS_KEYS, path)
     model = "OPENCV_FISHEYE" if values.get("is_fisheye") else values.get("camera_model", "OPENCV")
     if model not in TRANSFORMS_MODELS:
         refuse_model(model, TRANSFORMS_MODELS, path)
-    model = model if model in COEFFICIENTS else "OPENCV"
-    fx, fy, cx, cy, width, height = needed(values, ("fl_x", "fl_y", "cx", "cy", "w", "h"), path)
-    return Calibration((fx, fy, cx - 0.5, cy - 0.5), _lens(values, model, path), size_of(width, height, path), model)
+    return _camera(values, names, path, model if model in COEFFICIENTS else "OPENCV", corner=0.5)
 
 
 def _opencv(values: Mapping[str, Any], path: Path) -> Calibration:
@@ -198,9 +204,7 @@ def _mast3r_slam(values: Mapping[str, Any], path: Path) -> Calibration:
     width, height = needed(values, ("width", "height"), path)
     numbers = numbers_of(values["calibration"], "calibration", path)
     if len(numbers) not in (4, 8, 9):
-        raise ValueError(
-            f"{path}: calibration must be fx, fy, cx, cy(, k1, k2, p1, p2(, k3)), got {len(numbers)}: correct it"
-        )
+        raise ValueError(f"{path}: calibration must be fx, fy, cx, cy(, k1, k2, p1, p2(, k3)), got {len(numbers)}")
     fx, fy, cx, cy, *bent = numbers
     return Calibration((fx, fy, cx, cy), lens_of("OPENCV", bent, path), size_of(width, height, path))
 
@@ -216,15 +220,12 @@ def _orb_slam(values: Mapping[str, Any], path: Path) -> Calibration:
     model = ORB_MODELS.get(str(name).lower()) or refuse_model(name, [*ORB_MODELS], path)
     values = {"Camera.width": values.get("Camera.cols"), "Camera.height": values.get("Camera.rows")} | dict(values)
     values = {key: value for key, value in values.items() if value is not None}
-    names = [f"{section}.{key}" for key in ("fx", "fy", "cx", "cy")]
-    fx, fy, cx, cy, width, height = needed(values, [*names, "Camera.width", "Camera.height"], path)
-    lens = _lens(values, model, path, f"{section}.")
-    return Calibration((fx, fy, cx, cy), lens, size_of(width, height, path), model)
+    names = *(f"{section}.{key}" for key in ("fx", "fy", "cx", "cy")), "Camera.width", "Camera.height"
+    return _camera(values, names, path, model, f"{section}.")
 
 
 def _plain(values: Mapping[str, Any], path: Path) -> Calibration:
     """width, height, fx, fy, cx, cy as ViPE takes them, and maybe the distortion."""
-    names = ("width", "height", "fx", "fy", "cx", "cy")
+    names = ("fx", "fy", "cx", "cy", "width", "height")
     _check_known(values, {*names, *DISTORTION}, path)
-    width, height, fx, fy, cx, cy = needed(values, names, path)
-    return Calibration((fx, fy, cx, cy), _lens(values, "OPENCV", path), size_of(width, height, path))
+    return _camera(values, names, path)

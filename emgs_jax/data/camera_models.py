@@ -48,20 +48,14 @@ LENSES = {  # what ROS, OpenCV, Kalibr and EuRoC call the distortion of a pinhol
 
 @dataclass(frozen=True)
 class Calibration:
-    """A camera.
+    """A camera."""
 
-    Args:
-        intrinsics: fx, fy, cx, cy of the images on disk, pixel centres at integers.
-        distortion: the other parameters of `model`: of OPENCV k1, k2, p1, p2, maybe k3, and maybe k4, k5, k6; empty for
-            a pinhole camera.
-        size: (width, height) of the images that it is for; None where nothing says.
-        model: OPENCV for all of OPENCV_FAMILY, else COLMAP's name.
-    """
-
-    intrinsics: Intrinsics
+    intrinsics: Intrinsics  # fx, fy, cx, cy of the images on disk, pixel centres at integers
+    # the other parameters of `model`: of OPENCV k1, k2, p1, p2, maybe k3, and maybe k4, k5, k6; empty for a pinhole
+    # camera
     distortion: tuple[float, ...] = ()
-    size: Size | None = None
-    model: str = "OPENCV"
+    size: Size | None = None  # (width, height) of the images that it is for; None where nothing says
+    model: str = "OPENCV"  # OPENCV for all of OPENCV_FAMILY, else COLMAP's name
 
     @property
     def is_pinhole(self) -> bool:
@@ -159,11 +153,7 @@ def load_pycolmap(otherwise: str) -> ModuleType:
 
 
 def to_pycolmap(camera: Calibration, size: Size) -> Any:
-    """pycolmap's camera, whose pixels have integers at their centres.
-
-    Raises:
-        ValueError: pycolmap is not installed.
-    """
+    """pycolmap's camera, whose pixels have integers at their centres; ValueError where it is not installed."""
     pycolmap = load_pycolmap(
         "images with lens distortion are straightened by pycolmap, which is not installed (for Linux on ARM there "
         "is no wheel): build it from the source of COLMAP, or undistort the images on another machine"

@@ -57,14 +57,10 @@ class Checksums:
 
 
 def find_checksums(checksums: str | None, dataset: Dataset) -> Checksums | None:
-    """The list for a data set, None where there is none.
+    """The list for a data set, None where there is none; ValueError where it cannot be read or lacks an image.
 
-    Args:
-        checksums: `off`; a file; or `auto`, SHA256SUMS in the folder of the first image or one above, if it is there.
-        dataset: of the images, each of which has to be in the list.
-
-    Raises:
-        ValueError: the list cannot be read, or lacks an image.
+    It is `off`; a file; or `auto`, SHA256SUMS in the folder of the first image or one above, if it is there. Each image
+    has to be in the list.
     """
     if checksums in ("off", None, False) or not dataset.files(0):
         return None
@@ -94,14 +90,13 @@ def read_sums(path: Path) -> dict[Path, tuple[int, str]]:
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
-        parts = re.fullmatch(r"(\\?)([0-9a-fA-F]{64}) [ *](.+)", line)
+        parts = re.fullmatch(r"([0-9a-fA-F]{64}) [ *](.+)", line)
         if parts is None or "\0" in line:
             raise ValueError(
                 f"{path}, line {number}: expected 64 hexadecimal digits, two spaces and a name, got {line[:80]!r}; "
                 f"write the list again {WRITE}"
             )
-        name = _unescaped(parts[3]) if parts[1] else parts[3]
-        found[_place(path.parent / name)] = number, parts[2].lower()
+        found[_place(path.parent / parts[2])] = number, parts[1].lower()
     return found
 
 
@@ -111,8 +106,3 @@ def _place(file: Path) -> Path:
         return Path(os.path.realpath(file))
     except ValueError:  # a zero byte in a name from a damaged list
         return file
-
-
-def _unescaped(name: str) -> str:
-    """The name in a line that begins with a backslash, which says that newlines and backslashes in it are escaped."""
-    return re.sub(r"\\(.)", lambda sign: {"n": "\n", "r": "\r"}.get(sign[1], sign[1]), name)

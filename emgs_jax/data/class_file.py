@@ -19,41 +19,31 @@ REMEDY = "give a name a line, `id name` a line, or YAML with class_names_reduced
 
 @dataclass(frozen=True)
 class ClassFile:
-    """Classes of a file.
-
-    Args:
-        names: of the classes, each once.
-        positions: by id of the data set, the position in `names`, -1 = no class; None where the file has no ids.
-    """
+    """Classes of a file."""
 
     path: str
-    names: tuple[str, ...]
+    names: tuple[str, ...]  # of the classes, each once
+    # by id of the data set, the position in `names`, -1 = no class; None where the file has no ids
     positions: Mapping[int, int] | None
 
     def positions_of(self, ids: np.ndarray, what: object) -> np.ndarray:
-        """Position in `names` of each id (n,), -1 = no class.
+        """Position in `names` of each id (n,), -1 = no class; ValueError where the file has no ids, or some id no name.
 
-        Args:
-            ids: whole numbers.
-            what: names their file in messages.
-
-        Raises:
-            ValueError: the file has no ids, or some id has no name.
+        `what` names the file of the ids in messages.
         """
         if self.positions is None:
             raise ValueError(f"{self.path} has names without ids, which {what} needs: {REMEDY}")
         found, inverse = np.unique(ids, return_inverse=True)
         unnamed = [int(number) for number in found if int(number) not in self.positions]
         cut = {number: [n for n in (number - 256, number + 256) if n in self.positions] for number in unnamed}
+        nameless = f"{what}: no name in {self.path} for {_some(unnamed)}"
         if unnamed and all(cut.values()):
             raise ValueError(
-                f"{what}: no name in {self.path} for {_some(unnamed)}, but for {_some([n[0] for n in cut.values()])}: "
-                "ids of 16 bits were read or written as 8 bits; export them again with 16 bits or as text"
+                f"{nameless}, but for {_some([n[0] for n in cut.values()])}: ids of 16 bits were read or written as 8 "
+                "bits; export them again with 16 bits or as text"
             )
         if unnamed:
-            raise ValueError(
-                f"{what}: no name in {self.path} for {_some(unnamed)}: give the class file of this data set"
-            )
+            raise ValueError(f"{nameless}: give the class file of this data set")
         return np.array([self.positions[int(number)] for number in found], np.int64)[inverse.reshape(np.shape(ids))]
 
 
@@ -82,13 +72,13 @@ def read_classes(path: str | os.PathLike) -> ClassFile:
 
 def _of_yaml(text: str) -> tuple[list[str], dict[int, int]]:
     content = yaml.safe_load(text)
-    missing = [key for key in ("class_names_reduced", "map_to_reduced") if key not in _mapping(content, "it")]
+    missing = [key for key in ("class_names_reduced", "map_to_reduced") if key not in _checked(Mapping, content, "it")]
     if missing:
         raise ValueError(f"it lacks {', '.join(missing)}")
-    names = [_word(name) for name in _list(content["class_names_reduced"])]
+    names = [_word(name) for name in _checked(list, content["class_names_reduced"], "class_names_reduced")]
     # OVO leaves out points of classes that the scenes do not have; what has not even a name is an error.
-    positions = {number: -1 for number, _ in enumerate(_list(content.get("class_names") or []))}
-    for number, position in _mapping(content["map_to_reduced"], "map_to_reduced").items():
+    positions = {number: -1 for number, _ in enumerate(_checked(list, content.get("class_names") or [], "class_names"))}
+    for number, position in _checked(Mapping, content["map_to_reduced"], "map_to_reduced").items():
         if not isinstance(number, int) or not isinstance(position, int) or not 0 <= position <= len(names):
             raise ValueError(f"map_to_reduced says {number!r}: {position!r}, and there are {len(names)} classes")
         positions[number] = position if position < len(names) else -1
@@ -109,15 +99,9 @@ def _of_lines(text: str) -> tuple[list[str], dict[int, int] | None]:
     return [_word(row[2]) for row in rows if row], {0: -1} | positions
 
 
-def _mapping(value: Any, what: str) -> Mapping[Any, Any]:
-    if not isinstance(value, Mapping):
-        raise ValueError(f"{what} is no mapping")
-    return value
-
-
-def _list(value: Any) -> list[Any]:
-    if not isinstance(value, list):
-        raise ValueError(f"expected a list, got {type(value).__name__}")
+def _checked(kind: type, value: Any, what: str) -> Any:
+    if not isinstance(value, kind):
+        raise ValueError(f"{what} is no {kind.__name__.lower()}")
     return value
 
 

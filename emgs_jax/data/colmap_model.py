@@ -4,47 +4,32 @@ Its poses are world → camera; ours are camera → world. pycolmap does not rea
 hang or ask for gigabytes, it names no line, and it wants all points.
 """
 
-import math
 import struct
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from emgs_jax.data import reading
 from emgs_jax.data.camera_models import MODELS, Calibration, as_number, from_colmap, size_of
 
 TEXT, BINARY = ("cameras.txt", "images.txt"), ("cameras.bin", "images.bin")
-MAX_NORM_ERROR = 1e-2  # of a quaternion: files of others have few digits
 POINT_SIZE = 24  # bytes of a point in images.bin: x, y and the number of its landmark
+Image = tuple[str, int, np.ndarray]  # name, camera and world → camera (4, 4)
 
 
 @dataclass(frozen=True)
 class SparseModel:
-    """The cameras and images of a model.
+    """The cameras and images of a model."""
 
-    Args:
-        cameras: by id.
-        names: of the image files, below the folder of images.
-        T_world_camera: (n, 4, 4), in the model's unit.
-    """
-
-    cameras: dict[int, Calibration]
-    names: list[str]
+    cameras: dict[int, Calibration]  # by id
+    names: list[str]  # of the image files, below the folder of images
     camera_ids: list[int]
-    T_world_camera: np.ndarray
+    T_world_camera: np.ndarray  # (n, 4, 4), in the model's unit
     files: tuple[Path, ...]
-
-
-def load_colmap(folder: Path) -> SparseModel:
-    """Read the cameras and images of a model, from binary files where they are there, as COLMAP does, else from text.
-
-    Raises:
-        ValueError: a line or a record is damaged, or there is no image with a pose.
-    """
-    return (_load_binary if all((folder / name).is_file() for name in BINARY) else _load_text)(folder)
 
 
 class _Records:
@@ -52,6 +37,13 @@ class _Records:
 
     def __init__(self, path: Path) -> None:
         self._path, self._data, self._place = path, reading.read_bytes(path), 0
+
+    def __iter__(self) -> Iterator[Self]:
+        """Itself, once for each record that it announces; then it must end."""
+        for _ in range(*self.values("Q")):
+            yield self
+        if self._place < len(self._data):
+            raise ValueError(f"{self._path} is damaged: it goes on after its last record; export the model again")
 
     def values(self, layout: str) -> tuple[Any, ...]:
         """The next values; little-endian and without gaps."""
@@ -68,9 +60,28 @@ class _Records:
         self._place += size
         return self._data[self._place - size : self._place]
 
-    def end(self) -> None:
-        if self._place < len(self._data):
-            raise ValueError(f"{self._path} is damaged: it goes on after its last record; export the model again")
+
+def is_model(folder: Path) -> bool:
+    return any(all((folder / name).is_file() for name in names) for names in (TEXT, BINARY))
+
+
+def load_colmap(folder: Path) -> SparseModel:
+    """Read the cameras and images of a model, from binary files where they are there, as COLMAP does, else from text.
+
+    Raises:
+        ValueError: a line or a record is damaged, or there is no image with a pose, or one of no camera or twice.
+    """
+    is_binary = all((folder / name).is_file() for name in BINARY)
+    cameras_file, images_file = (folder / name for name in (BINARY if is_binary else TEXT))
+    cameras, images = load_cameras(cameras_file), (_binary_images if is_binary else _text_images)(images_file)
+    if not images:
+        raise ValueError(f"{folder} has no images with a pose: register some, or give another model")
+    names, ids, poses = (list(column) for column in zip(*images, strict=True))
+    if missing := sorted({*ids} - cameras.keys()):
+        raise ValueError(f"{folder}: images are of camera {missing[0]}, which has no line: export the model again")
+    if twice := [name for name, count in Counter(names).items() if count > 1]:
+        raise ValueError(f"{folder} has {twice[0]} twice: export the model again")
+    return SparseModel(cameras, names, ids, np.linalg.inv(poses), (cameras_file, images_file))
 
 
 def load_cameras(path: Path) -> dict[int, Calibration]:
@@ -79,20 +90,19 @@ def load_cameras(path: Path) -> dict[int, Calibration]:
 
 
 def _binary_cameras(path: Path) -> dict[int, Calibration]:
-    records, cameras, names = _Records(path), {}, [*MODELS]
-    for _ in range(*records.values("Q")):
-        key, number, *size = records.values("IiQQ")
+    cameras, names = {}, [*MODELS]
+    for record in _Records(path):
+        key, number, *size = record.values("IiQQ")
         if not 0 <= number < len(names) or key in cameras:
             raise ValueError(f"{path} is damaged: camera {key} is there twice or of no model; export it again")
-        params = records.values(f"{len(MODELS[names[number]].split())}d")
+        params = record.values(f"{len(MODELS[names[number]].split())}d")
         cameras[key] = from_colmap(names[number], params, size_of(*size, path), path)
-    records.end()
     return cameras
 
 
 def _text_cameras(path: Path) -> dict[int, Calibration]:
     cameras: dict[int, Calibration] = {}
-    for number, line in _lines(path):
+    for number, line in enumerate(reading.read_text(path).splitlines(), start=1):
         words = line.split()
         if not words or words[0].startswith("#"):
             continue
@@ -104,140 +114,71 @@ def _text_cameras(path: Path) -> dict[int, Calibration]:
     return cameras
 
 
-def _load_binary(folder: Path) -> SparseModel:
-    """Read cameras.bin and images.bin, whose layout is in COLMAP's documentation of its output format."""
-    cameras_file, images_file = (folder / name for name in BINARY)
-    cameras = load_cameras(cameras_file)
-    records, images = _Records(images_file), []
-    for _ in range(*records.values("Q")):
-        number, *values = records.values("I7dI")
-        name, place = records.text(), f"{images_file}, image {number}"
-        records.skip(POINT_SIZE * records.values("Q")[0])
-        images.append((number, name, values[-1], _pose(np.array(values[:-1]), place)))
-    records.end()
-    images.sort(key=lambda image: image[0])
-    names, ids, poses = ([image[column] for image in images] for column in (1, 2, 3))
-    return _checked(SparseModel(cameras, names, ids, _inverted(poses), (cameras_file, images_file)), folder)
+def _binary_images(path: Path) -> list[Image]:
+    """Images in order of their numbers; the layout is in COLMAP's documentation of its output format."""
+    found = {}
+    for record in _Records(path):
+        number, *values, camera = record.values("I7dI")
+        name = record.text()
+        record.skip(POINT_SIZE * record.values("Q")[0])
+        found[number] = name, camera, _pose(values, f"{path}, image {number}")
+    return [found[number] for number in sorted(found)]
 
 
-def check_whole(folder: Path) -> None:
-    """Check that the binary files of a model do not end too soon; pycolmap would not end.
-
-    Raises:
-        ValueError: one does.
-    """
-    for path in sorted(folder.glob("*.bin")):
-        if path.stem in _SKIP:
-            records = _Records(path)
-            for _ in range(*records.values("Q")):
-                _SKIP[path.stem](records)
-            records.end()
-
-
-def _skip_camera(records: _Records) -> None:
-    _, number, _, _ = records.values("IiQQ")
-    known = [*MODELS.values()]
-    records.skip(8 * len(known[number].split()) if 0 <= number < len(known) else -1)
-
-
-def _skip_image(records: _Records) -> None:
-    records.values("I7dI")
-    records.text()
-    records.skip(POINT_SIZE * records.values("Q")[0])
-
-
-def _skip_point(records: _Records) -> None:
-    records.skip(43)
-    records.skip(8 * records.values("Q")[0])
-
-
-def _skip_rig(records: _Records) -> None:
-    _, count = records.values("II")
-    for number in range(count):
-        records.values("iI")
-        if number and records.values("?")[0]:
-            records.values("7d")
-
-
-def _skip_frame(records: _Records) -> None:
-    records.values("II7d")
-    records.skip(16 * records.values("I")[0])
-
-
-_SKIP = {
-    "cameras": _skip_camera,
-    "images": _skip_image,
-    "points3D": _skip_point,
-    "rigs": _skip_rig,
-    "frames": _skip_frame,
-}
-
-
-def _load_text(folder: Path) -> SparseModel:
-    """Read cameras.txt and images.txt."""
-    cameras_file, images_file = (folder / name for name in TEXT)
-    cameras = load_cameras(cameras_file)
-    names, ids, poses = [], [], []
-    lines = iter(_lines(images_file))
+def _text_images(path: Path) -> list[Image]:
+    images = []
+    lines = enumerate(reading.read_text(path).splitlines(), start=1)
     for number, line in lines:
         if not line.strip() or line.lstrip().startswith("#"):
             continue
-        name, camera_id, pose = _image(line, f"{images_file}:{number}")
-        names.append(name)
-        ids.append(camera_id)
-        poses.append(pose)
+        words, place = line.strip().split(maxsplit=9), f"{path}:{number}"
+        try:
+            values, camera, name = [float(word) for word in words[1:8]], int(words[8]), words[9]
+        except (ValueError, IndexError) as error:
+            raise ValueError(
+                f"{place}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line[:80]!r} ({error}): "
+                "export the model again"
+            ) from error
+        images.append((name, camera, _pose(values, place)))
         after, points = next(lines, (number + 1, ""))
         words = points.split()
-        if len(words) % 3 or (words and not _is_whole(words[-1])):  # a name of three words is no point
+        if len(words) % 3 or (words and not words[-1].removeprefix("-").isdecimal()):  # a name of three words
             raise ValueError(
-                f"{images_file}:{after}: expected the points of image {name} (X Y POINT3D_ID each) or an empty line, "
+                f"{path}:{after}: expected the points of image {name} (X Y POINT3D_ID each) or an empty line, "
                 f"got {points[:80]!r}: every image has two lines"
             )
-    return _checked(SparseModel(cameras, names, ids, _inverted(poses), (cameras_file, images_file)), folder)
+    return images
 
 
-def _is_whole(word: str) -> bool:
-    return word.removeprefix("-").isdecimal()
-
-
-def _lines(path: Path) -> list[tuple[int, str]]:
-    return [*enumerate(reading.read_text(path).splitlines(), start=1)]
-
-
-def _image(line: str, place: str) -> tuple[str, int, np.ndarray]:
-    """Name, camera and world → camera (4, 4) of a line of images.txt."""
-    words = line.strip().split(maxsplit=9)
-    try:
-        values = np.array([float(word) for word in words[1:8]])
-        camera_id, name = int(words[8]), words[9]
-    except (ValueError, IndexError) as error:
-        raise ValueError(
-            f"{place}: expected IMAGE_ID QW QX QY QZ TX TY TZ CAMERA_ID NAME, got {line[:80]!r} ({error}): "
-            "export the model again"
-        ) from error
-    return name, camera_id, _pose(values, place)
-
-
-def _pose(values: np.ndarray, place: str) -> np.ndarray:
+def _pose(values: Sequence[float], place: str) -> np.ndarray:
     """World → camera (4, 4) of QW QX QY QZ TX TY TZ."""
-    if not np.isfinite(values).all() or abs(math.hypot(*values[:4]) - 1) > MAX_NORM_ERROR:
-        raise ValueError(f"{place}: the pose is not finite or its quaternion has not length 1: export the model again")
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[[1, 2, 3, 0]]).as_matrix(), values[4:]
-    return pose
+    w, x, y, z, *position = values
+    try:
+        return reading.rigid(position, (x, y, z, w))
+    except ValueError as error:
+        raise ValueError(f"{place}: the pose is not finite or {error}: export the model again") from error
 
 
-def _inverted(poses: list[np.ndarray]) -> np.ndarray:
-    return np.linalg.inv(np.array(poses, np.float64).reshape(-1, 4, 4))
+def check_whole(folder: Path) -> None:
+    """Check that the binary files of a model do not end too soon, which is a ValueError: pycolmap would not end."""
+    for path in sorted(folder.glob("*.bin")):
+        if path.stem in _CHECKED:
+            _CHECKED[path.stem](path)
 
 
-def _checked(model: SparseModel, folder: Path) -> SparseModel:
-    """The model, whose images all name a camera of it and are named once."""
-    if not model.names:
-        raise ValueError(f"{folder} has no images with a pose: register some, or give another model")
-    if missing := sorted({*model.camera_ids} - model.cameras.keys()):
-        raise ValueError(f"{folder}: images are of camera {missing[0]}, which has no line: export the model again")
-    if len({*model.names}) < len(model.names):
-        twice = next(name for name in model.names if model.names.count(name) > 1)
-        raise ValueError(f"{folder} has {twice} twice: export the model again")
-    return model
+def _check_rigs(path: Path) -> None:
+    for record in _Records(path):
+        _, count = record.values("II")
+        for number in range(count):
+            record.values("iI")
+            if number and record.values("?")[0]:
+                record.values("7d")
+
+
+_CHECKED: dict[str, Callable[[Path], object]] = {
+    "cameras": _binary_cameras,
+    "images": _binary_images,
+    "points3D": lambda path: [record.skip(8 * record.values("43xQ")[0]) for record in _Records(path)],
+    "rigs": _check_rigs,
+    "frames": lambda path: [record.skip(16 * record.values("II7dI")[-1]) for record in _Records(path)],
+}

@@ -1,48 +1,37 @@
 """EuRoC MAV, and what has its layout (ASL): images of one camera on a rig, whose motion is known; no depth."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
-
-import numpy as np
 
 from emgs_jax.data import reading
 from emgs_jax.data.calibration_files import Calibration, kalibr_camera, numbers_of, parse_keys
 from emgs_jax.data.posed_images import Pose, PosedImages, Solved
 from emgs_jax.data.reading import Number
-from emgs_jax.data.timestamps import check_tolerance, matched_rows
-from emgs_jax.data.tum import as_transform, read_list
+from emgs_jax.data.timestamps import check_tolerance
+from emgs_jax.data.tum import as_transform, nearest_lines, read_list
 
 LAYOUT = "root/SEQUENCE/mav0/{cam0/{data.csv, sensor.yaml, data/}, state_groundtruth_estimate0/data.csv}"
 SOURCE = "EuRoC MAV dataset of the ASL at ETH Zurich, the zip of a sequence in ASL format"
 ORDER = (0, 1, 2, 4, 5, 6, 3)  # from x y z qw qx qy qz to TUM's order
 
 
+@dataclass(eq=False)
 class Euroc(PosedImages):
-    """One camera of one sequence of EuRoC, straightened; without state_groundtruth_estimate0 there are no poses.
+    """One camera of one sequence, such as "MH_01_easy", straightened; images of data.csv are in order of time.
 
-    Args:
-        sequence: "MH_01_easy".
-        camera: "cam0" (left) or "cam1".
-        start, stop, stride: which of the images in data.csv, in order of time.
-        max_time_difference: seconds between an image and its pose.
+    Without state_groundtruth_estimate0 there are no poses.
     """
 
-    name = "euroc"
+    size: Sequence[int] = (376, 240)
+    camera: str = "cam0"  # "cam0" (left) or "cam1"
+    max_time_difference: Number = 0.02  # seconds between an image and its pose
 
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | None = None,
-        camera: str = "cam0",
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Sequence[int] = (376, 240),
-        max_time_difference: Number = 0.02,
-    ) -> None:
-        folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
-        solved = read_euroc(folder / "mav0", camera, check_tolerance(max_time_difference))
-        super().__init__(folder, solved, (start, stop, stride), size, str(sequence))
+    name, layout, source = "euroc", LAYOUT, SOURCE
+
+    def __post_init__(self) -> None:
+        folder = self._find(self.sequence)
+        self._take(folder, read_euroc(folder / "mav0", self.camera, check_tolerance(self.max_time_difference)))
 
 
 def read_euroc(folder: Path, camera: str, tolerance: float) -> Solved:
@@ -58,28 +47,21 @@ def read_euroc(folder: Path, camera: str, tolerance: float) -> Solved:
             raise FileNotFoundError(f"{path} is missing; expected the layout {LAYOUT} ({SOURCE})")
     times, names, _ = read_list(images, 2)
     found, T_body_camera = read_sensor(sensor)
-    truth, poses = folder / "state_groundtruth_estimate0" / "data.csv", [None] * len(times)
-    if truth.is_file() and len(times):
-        poses = body_poses(truth, times, tolerance)
+    truth = folder / "state_groundtruth_estimate0" / "data.csv"
+    known = nearest_lines(truth, 8, times, tolerance, "pose") if len(times) else None
+
+    def pose(words: list[str], line: int) -> Pose | None:
+        T_world_body = as_transform([words[i] for i in ORDER], f"{truth}, line {line}:")
+        return None if T_world_body is None else T_world_body @ T_body_camera
+
     return Solved(
         [folder / camera / "data" / name for (name,) in names],
-        [None if pose is None else pose @ T_body_camera for pose in poses],
+        [one and pose(*one) for one in known or [None] * len(times)],
         found,
         images,
         (images, sensor, *([truth] if truth.is_file() else [])),
         times.tolist(),
     )
-
-
-def body_poses(path: Path, times: np.ndarray, tolerance: float) -> list[Pose | None]:
-    """T_world_body nearest to each time, from lines of time, position, quaternion (w first) and more."""
-    known, words, lines = read_list(path, 8)
-    rows = matched_rows(times, known, tolerance, ("pose", path))
-
-    def pose(row: int) -> Pose | None:
-        return as_transform([words[row][i] for i in ORDER], f"{path}, line {lines[row]}:")
-
-    return [None if row < 0 else pose(row) for row in rows]
 
 
 def read_sensor(path: Path) -> tuple[Calibration, Pose]:

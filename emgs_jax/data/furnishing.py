@@ -27,13 +27,15 @@ def furnish(
         middle: parts in the world, which stay.
         lanes: points (x, y) of the routes through the room.
     """
+    low, high = np.array(area.low) - 1e-6, np.array(area.high) + 1e-6
     parts, taken = [*middle], [*([bounds(middle)] if middle else []), *_doorsteps(area)]
     for build in pieces:
         piece = _with_back(build(rng))
         for _ in range(TRIES):
             placed = at_wall(piece, area, int(rng.choice(area.walls)), rng.uniform())
             box = bounds(placed)
-            if _is_inside(box, area) and not _meets(box, taken, GAP).any() and _distance(lanes, box) > LANE:
+            is_inside = (box[0, :2] > low).all() and (box[1, :2] < high).all()
+            if is_inside and not _meets(box, taken, GAP).any() and _distance(lanes, box) > LANE:
                 parts, taken = parts + placed, [*taken, box]
                 break
     return parts
@@ -68,10 +70,6 @@ def _doorsteps(area: Area) -> list[Bounds]:
         center[wall % 2], half[wall % 2] = across, DOORSTEP
         boxes.append(np.array([[*(center - half), 0.0], [*(center + half), DOOR_HEIGHT]]))
     return boxes
-
-
-def _is_inside(box: Bounds, area: Area) -> bool:
-    return bool((box[0, :2] > np.array(area.low) - 1e-6).all() and (box[1, :2] < np.array(area.high) + 1e-6).all())
 
 
 def _meets(box: Bounds, others: list[Bounds], gap: float) -> Bool[np.ndarray, " n"]:

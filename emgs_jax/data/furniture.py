@@ -8,6 +8,8 @@ from jaxtyping import Float
 
 from emgs_jax.data.reading import Number
 
+# Classes of a room; a label is the position in here.
+CLASSES = ("wall", "floor", "ceiling", "table", "chair", "sofa", "shelf", "cabinet", "lamp", "picture", "box", "ball")
 Part = tuple[str, trimesh.Trimesh]  # class and mesh of an object
 
 

@@ -31,20 +31,13 @@ ALTERNATIVES = (
 
 @dataclass(frozen=True)
 class Pictures:
-    """The images in use, of one camera.
+    """The images in use, of one camera."""
 
-    Args:
-        size: (width, height) on disk.
-        read: RGB image 0..count-1 as it is on disk; raises BadFrameError.
-        files: their files; empty for a video.
-        name: of them all, for messages.
-    """
-
-    size: Size
+    size: Size  # (width, height) on disk
     count: int
-    read: Callable[[int], UInt8[np.ndarray, "_ _ 3"]]
-    files: Sequence[Path] = ()
-    name: str = "images"
+    read: Callable[[int], UInt8[np.ndarray, "_ _ 3"]]  # RGB image 0..count-1 as it is on disk; raises BadFrameError
+    files: Sequence[Path] = ()  # their files; empty for a video
+    name: str = "images"  # of them all, for messages
 
 
 Estimator = Callable[[Pictures], tuple[Calibration, dict[str, Any]]]
@@ -53,17 +46,11 @@ Given = str | Sequence[Number | str] | Estimator  # dataset.intrinsics; a functi
 
 @dataclass(frozen=True)
 class Lens:
-    """Undistortion of images: they become those of a pinhole camera.
+    """Undistortion of images: they become those of a pinhole camera."""
 
-    Args:
-        intrinsics: fx, fy, cx, cy of the straight images, which have the size of those on disk.
-        maps: tables of cv2.remap; None where the images are straight.
-        about: where the intrinsics come from, plain values for metrics.json.
-    """
-
-    intrinsics: Intrinsics
-    maps: Maps | None
-    about: Mapping[str, Any]
+    intrinsics: Intrinsics  # fx, fy, cx, cy of the straight images, which have the size of those on disk
+    maps: Maps | None  # tables of cv2.remap; None where the images are straight
+    about: Mapping[str, Any]  # where the intrinsics come from, plain values for metrics.json
 
     def straighten(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """The image without distortion, interpolated."""
@@ -177,9 +164,7 @@ def from_exif(pictures: Pictures) -> Calibration:
         )
     if len(found) > 1:
         each = ", ".join(f"{value:g} mm in {path.name}" for value, path in found.items())
-        raise ValueError(
-            f"dataset.intrinsics=exif: the images were taken with several focal lengths ({each}): take those of one"
-        )
+        raise ValueError(f"dataset.intrinsics=exif: there are several focal lengths ({each}): take those of one")
     (millimetres,) = found
     (w, h) = pictures.size
     focal = millimetres / DIAGONAL_35_MM * math.hypot(w, h)

@@ -1,6 +1,7 @@
 """KITTI odometry: rectified images of a car, and the motion of its left grey camera; no depth."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -16,43 +17,30 @@ LAYOUT = "root/{sequences/00/{image_2/, calib.txt, times.txt}, poses/00.txt}"
 SOURCE = "KITTI odometry benchmark: colour images, calibration files and ground truth poses, project page at KIT"
 
 
+@dataclass(eq=False)
 class Kitti(PosedImages):
-    """One camera of one sequence of KITTI odometry; 11 to 21 have no poses.
+    """One camera of one sequence of KITTI odometry below root, which has sequences/ and poses/; 11 to 21 have no poses.
 
     The world is that of poses/00.txt: the left grey camera at the first image of the sequence.
-
-    Args:
-        root: folder that holds sequences/ and poses/.
-        sequence: "00"; of 7 the two digits 07.
-        camera: 0 and 1 are grey, 2 and 3 in colour, left and right.
-        start, stop, stride: which of the images, in order of their names.
     """
 
-    name = "kitti"
+    sequence: str | int | None = None  # "00"; of 7 the two digits 07
+    size: Sequence[int] = (480, 144)
+    camera: int = 2  # 0 and 1 are grey, 2 and 3 in colour, left and right
 
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | int | None = None,
-        camera: int = 2,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Sequence[int] = (480, 144),
-    ) -> None:
-        name = None if sequence is None else str(sequence).zfill(2)
-        place = None if name is None else f"sequences/{name}"
-        folder = reading.find_sequence(root, place, LAYOUT, SOURCE)
-        solved = read_kitti(folder, folder.parents[1] / "poses" / f"{name}.txt", camera)
-        super().__init__(folder, solved, (start, stop, stride), size, str(name))
+    name, layout, source = "kitti", LAYOUT, SOURCE
+
+    def __post_init__(self) -> None:
+        self.sequence = None if self.sequence is None else str(self.sequence).zfill(2)
+        folder = self._find(self.sequence and f"sequences/{self.sequence}")
+        truth = folder.parents[1] / "poses" / f"{self.sequence}.txt"
+        self._take(folder, read_kitti(folder, truth, self.camera))
 
 
 def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
     """The images of a camera and its poses.
 
-    Args:
-        truth: poses of camera 0; a poses.txt in `folder` does as well, and without either there is none.
-        camera: 0 to 3.
+    `truth` has those of camera 0; a poses.txt in `folder` does as well, and without either there is none.
 
     Raises:
         FileNotFoundError: a file of the layout is missing.
@@ -70,7 +58,8 @@ def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
     if truth is not None:
         rows = read_rows(truth, len(paths))
         poses = [pose_of(row, f"{truth}, line {line}:", T_first_camera) for line, row in enumerate(rows, 1)]
-    times = [number_of(row, f"{clock}, line {line}:") for line, row in enumerate(read_rows(clock, len(paths)), 1)]
+    clocked = enumerate(read_rows(clock, len(paths)), 1)
+    times = [float(_numbers(row, 1, f"{clock}, line {line}:")[0]) for line, row in clocked]
     files = calibration, clock, *([] if truth is None else [truth])
     return Solved(paths, poses, intrinsics, truth or calibration, files, times)
 
@@ -101,13 +90,8 @@ def pose_of(row: str, where: str, T_first_camera: Pose) -> Pose | None:
     """T_world_camera of a row of twelve numbers, the upper part of that of camera 0; None where it is inf or nan."""
     if len(row.split()) != 12:
         raise BadFrameError(f"{where} {row[:80]!r} must be 12 numbers, the upper part of a pose: fetch the file again")
-    pose = reading.as_motion(f"{row} 0 0 0 1", where)
+    pose = reading.as_pose(f"{row} 0 0 0 1", where, may_be_far=True)
     return None if pose is None else pose @ T_first_camera
-
-
-def number_of(text: str, where: str) -> float:
-    """A finite number."""
-    return float(_numbers(text, 1, where)[0])
 
 
 def _numbers(text: str, count: int, where: str) -> Float[np.ndarray, " n"]:

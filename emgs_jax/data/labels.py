@@ -46,9 +46,7 @@ class LabelFolder:
     def read(self, image: str | Path, raw_size: tuple[int, int] | None = None) -> Int32[np.ndarray, "h w"]:
         """Position in `names` of each pixel of the image, -1 where there is no class.
 
-        Args:
-            image: file of the image, whose name is looked for.
-            raw_size: (width, height) that it must have.
+        The image's name is looked for; `raw_size` is the (width, height) that it must have.
 
         Raises:
             BadFrameError: the file cannot be read, is no image of ids or of another size, or has an id without a name.
@@ -62,9 +60,7 @@ class LabelFolder:
             )
         reading.check_raw_size(ids, raw_size, path)
         if ids.dtype == np.uint8 and self._largest_id > 255:
-            raise BadFrameError(
-                f"{path} has 8 bits, but {self.classes} has ids up to {self._largest_id}: write it with 16 bits"
-            )
+            raise BadFrameError(f"{path} has 8 bits, {self.classes} ids to {self._largest_id}: write it with 16 bits")
         try:
             return self._known.positions_of(ids, path).astype(np.int32)
         except ValueError as error:

@@ -15,24 +15,17 @@ PATTERNS = ("noise", "stripes", "checker")
 
 @dataclass(frozen=True)
 class Looks:
-    """Texture of every object: colours `low` and `high` are mixed by a pattern of the world position.
+    """Texture of every object: colours `low` and `high` are mixed by a pattern of the world position."""
 
-    Args:
-        low, high: RGB in 0..1.
-        scale: metres of one noise cell.
-        pattern: row of PATTERNS.
-        offset: where in the noise the object begins.
-        origin: where in the world, in metres, the texture is attached: copies of an object that stand apart look alike.
-        noise: random values of the lattice, wraps around.
-    """
-
+    # low, high: RGB in 0..1
     low: Float[np.ndarray, "n 3"]
     high: Float[np.ndarray, "n 3"]
-    scale: Float[np.ndarray, " n"]
-    pattern: Int[np.ndarray, " n"]
-    offset: Float[np.ndarray, "n 3"]
+    scale: Float[np.ndarray, " n"]  # metres of one noise cell
+    pattern: Int[np.ndarray, " n"]  # row of PATTERNS
+    offset: Float[np.ndarray, "n 3"]  # where in the noise the object begins
+    # where in the world, in metres, the texture is attached: copies of an object that stand apart look alike
     origin: Float[np.ndarray, "n 3"]
-    noise: Float[np.ndarray, "s s s"]
+    noise: Float[np.ndarray, "s s s"]  # random values of the lattice, wraps around
 
 
 def draw_looks(parts: list[Part], rng: np.random.Generator) -> Looks:

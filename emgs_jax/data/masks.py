@@ -20,19 +20,14 @@ MAX_STRETCH = 0.02  # relative difference of the sides' ratio, of a mask and its
 
 @dataclass(frozen=True)
 class Masks:
-    """Masks in a folder, each with the name of its image and the same sides or fewer pixels.
+    """Masks in a folder, each with the name of its image and the same sides or fewer pixels."""
 
-    Args:
-        folder: of images; None: no pixel is left out.
-        classes: names of what is left out, where the images hold ids of classes, see `LabelFolder`; None: what is black
-            is left out, as for COLMAP and nerfstudio.
-        names: file that names the ids, see `data.class_file`; needed with `classes`.
-        border: pixels around what is left out that are left out, too.
-    """
-
-    folder: str | None = None
+    folder: str | None = None  # of images; None: no pixel is left out
+    # names of what is left out, where the images hold ids of classes, see `LabelFolder`; None: what is black is left
+    # out, as for COLMAP and nerfstudio
     classes: Sequence[str] | None = None
-    names: str | None = None
+    names: str | None = None  # file that names the ids, see `data.class_file`; needed with `classes`
+    # pixels around what is left out that are left out, too
     border: int = field(default=2, metadata=ranged(low=0, high=1000))
 
     def __post_init__(self) -> None:
@@ -58,7 +53,7 @@ class Masks:
         return {stem(path.name): path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
 
     def check(self, names: Sequence[str]) -> None:
-        """Raise ValueError where an image of these names has no mask."""
+        """ValueError where an image of these names has no mask."""
         missing = [] if self.folder is None else [name for name in names if self._file(name) is None]
         if missing:
             raise ValueError(

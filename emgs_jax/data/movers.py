@@ -32,21 +32,13 @@ class Doorway:
 
 @dataclass(frozen=True)
 class Lane:
-    """A line that is free to walk on.
+    """A line that is free to walk on."""
 
-    Args:
-        line: its points; the first again at the end where it is closed.
-        walked: distance along it of the camera, for each image.
-        lead: distance along it from the camera to what it looks at.
-        chair: distance along it to the old place of a chair.
-        doorway: and from which image on the leaf swings open.
-    """
-
-    line: Float[np.ndarray, "m 2"]
-    walked: Float[np.ndarray, " n"]
-    lead: float
-    chair: float
-    doorway: Doorway
+    line: Float[np.ndarray, "m 2"]  # its points; the first again at the end where it is closed
+    walked: Float[np.ndarray, " n"]  # distance along it of the camera, for each image
+    lead: float  # distance along it from the camera to what it looks at
+    chair: float  # distance along it to the old place of a chair
+    doorway: Doorway  # and from which image on the leaf swings open
     opens: int
 
     def at(self, distance: Float[np.ndarray, " k"], aside: float = 0.0) -> Float[np.ndarray, "k 2"]:
@@ -64,16 +56,11 @@ class Lane:
 
 @dataclass(frozen=True)
 class Mover:
-    """One thing and where it is.
+    """One thing and where it is."""
 
-    Args:
-        part: class and mesh, in axes of its own.
-        poses: T_world_mover of each image.
-        states: of each image: MOVES, ELSEWHERE (it stands, not where it stays in the end) or STAYS.
-    """
-
-    part: Part
-    poses: Float[np.ndarray, "n 4 4"]
+    part: Part  # class and mesh, in axes of its own
+    poses: Float[np.ndarray, "n 4 4"]  # T_world_mover of each image
+    # of each image: MOVES, ELSEWHERE (it stands, not where it stays in the end) or STAYS
     states: UInt8[np.ndarray, " n"]
 
 

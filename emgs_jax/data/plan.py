@@ -32,45 +32,35 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Area:
-    """A rectangle of floor.
+    """A rectangle of floor."""
 
-    Args:
-        low, high: its corners (x, y).
-        walls: sides that have a wall; the others are open.
-        doors: (wall, x or y of the middle) of the doorways.
-    """
-
+    # low, high: its corners (x, y)
     low: Point
     high: Point
-    walls: tuple[int, ...] = (EAST, NORTH, WEST, SOUTH)
-    doors: tuple[tuple[int, float], ...] = ()
+    walls: tuple[int, ...] = (EAST, NORTH, WEST, SOUTH)  # sides that have a wall; the others are open
+    doors: tuple[tuple[int, float], ...] = ()  # (wall, x or y of the middle) of the doorways
 
 
 @dataclass(frozen=True)
 class Plan:
-    """The areas and the points that walks go through.
+    """The areas and the points that walks go through."""
 
-    Args:
-        living, dining, study, bedroom: rooms of four different sizes at the hall's west end.
-        twin: the western of the two equal rooms; `twin_bay` is the piece of hall before it.
-        hall, corner: the rest of the hall; the corner joins it to the gallery.
-        bay: the first of the gallery's bays; `end` closes it behind the last one.
-        north_door, south_door: middle of the doorways living–dining and study–bedroom.
-        west, east: x of the doorways from the hall to living and study, and to dining and bedroom.
-    """
-
+    # living, dining, study, bedroom: rooms of four different sizes at the hall's west end
     living: Area
     dining: Area
     study: Area
     bedroom: Area
-    twin: Area
+    twin: Area  # the western of the two equal rooms; `twin_bay` is the piece of hall before it
     twin_bay: Area
+    # hall, corner: the rest of the hall; the corner joins it to the gallery
     hall: Area
     corner: Area
-    bay: Area
+    bay: Area  # the first of the gallery's bays; `end` closes it behind the last one
     end: Area
+    # north_door, south_door: middle of the doorways living–dining and study–bedroom
     north_door: Point
     south_door: Point
+    # west, east: x of the doorways from the hall to living and study, and to dining and bedroom
     west: float
     east: float
 

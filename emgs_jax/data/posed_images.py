@@ -6,21 +6,20 @@ aligned with a scale says something (`trajectory/ate_sim3_m`). Without depth the
 Pixels are those that are stored: these programs do not turn images by their EXIF orientation, and poses are of them.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, UInt8
+from jaxtyping import Float
 
 from emgs_jax.data import reading
 from emgs_jax.data.calibration_files import Calibration, read_calibration
-from emgs_jax.data.colmap_model import BINARY, TEXT, SparseModel, load_colmap
+from emgs_jax.data.colmap_model import SparseModel, is_model, load_colmap
 from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_order, times_of
 from emgs_jax.data.intrinsics import to_lens
 from emgs_jax.data.straightened import Straightened
-from emgs_jax.data.tones import read_shown, tones_of
+from emgs_jax.data.tones import tones_of
 from emgs_jax.data.transforms_json import load_transforms
 
 Pose = Float[np.ndarray, "4 4"]
@@ -31,34 +30,29 @@ MODEL_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0")  # sparse/0 stand
 
 @dataclass(frozen=True)
 class Solved:
-    """Images of one camera with the poses and the calibration that another program solved for.
-
-    Args:
-        poses: T_world_camera of each, in the program's unit; None where there is none.
-        camera: of all of them.
-        source: the file that poses and camera come from.
-        times: seconds of each, where the images stand in order of time; None = from their names.
-    """
+    """Images of one camera with the poses and the calibration that another program solved for."""
 
     images: list[Path]
-    poses: list[Pose | None]
-    camera: Calibration
-    source: Path
+    poses: list[Pose | None]  # T_world_camera of each, in the program's unit; None where there is none
+    camera: Calibration  # of all of them
+    source: Path  # the file that poses and camera come from
     files: tuple[Path, ...]
+    # seconds of each, where the images stand in order of time; None = from their names
     times: list[float] | None = None
     note: str | None = None
 
 
+@dataclass(eq=False)
 class PosedImages(Straightened):
     """Base of the data sets in this file (a `Dataset`); images in the natural order of their folders and names."""
 
-    def __init__(
-        self, folder: Path, solved: Solved, chosen: tuple[int, int | None, int], size: Sequence[int], sequence: str
-    ) -> None:
+    _flags = reading.AS_STORED
+
+    def _take(self, folder: Path, solved: Solved) -> None:
         order, times, note = in_order(solved)
-        picked = reading.select(len(order), *chosen, solved.source)
-        self._folder, self._files, self._times = folder, solved.files, [times[place] for place in picked]
-        rows = [order[place] for place in picked]
+        chosen = self._select(len(order), solved.source)
+        self._folder, self._files, self._times = folder, solved.files, [times[place] for place in chosen]
+        rows = [order[place] for place in chosen]
         self._images, self._poses = [solved.images[row] for row in rows], [solved.poses[row] for row in rows]
         for path, pose in zip(self._images, self._poses, strict=True):
             if pose is not None:
@@ -68,26 +62,13 @@ class PosedImages(Straightened):
                 f"{solved.source} names {self._images[0].name} and {len(rows) - 1} others, and none of them is in "
                 f"{self._images[0].parent}: put the images there"
             )
-        raw_size = reading.first_size(self._images, self._images[0].parent, reading.AS_STORED)
+        raw_size = reading.first_size(self._images, self._images[0].parent, self._flags)
         lens = to_lens(solved.camera, raw_size, str(solved.source), {"source": solved.source.name})
         self._tones = tones_of(self._images)
-        self._use(lens, raw_size, size, solved.note, note, reading.transparency_note(self._images))
-        self.sequence = sequence
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def _place(self, index: int) -> tuple[float, str]:
-        return self._times[index], str(self._images[index])
-
-    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        return read_shown(self._images[index], self._raw_size, self._tones, reading.AS_STORED)
+        self._use(lens, raw_size, solved.note, note, reading.transparency_note(self._images))
 
     def pose(self, index: int) -> Pose | None:
         return self._poses[index]
-
-    def files(self, index: int) -> list[Path]:
-        return [self._images[index], *self._files]
 
     def _options(self) -> dict[str, Any]:
         return {"lens": self.calibration["distortion"], "images": [path.name for path in self._images]}
@@ -102,82 +83,44 @@ def in_order(solved: Solved) -> tuple[list[int], list[float], str | None]:
     return order, times, "; ".join(filter(None, (of_order, note))) or None
 
 
+@dataclass(eq=False)
 class Colmap(PosedImages):
-    """A project of COLMAP: the images that are registered in a sparse model, of one camera.
+    """A project of COLMAP in root or root/sequence: the images that are registered in a sparse model, of one camera."""
 
-    Args:
-        sequence: folder below root; None = root itself.
-        model: folder of the model below that; None = the first of MODEL_FOLDERS that has one, of several the largest.
-        images: folder of the images below that.
-        start, stop, stride: which of the registered images, in natural order of their names.
-    """
+    # folder of the model below that; None = the first of MODEL_FOLDERS that has one, of several the largest
+    model: str | None = None
+    images: str = "images"  # folder of the images below that
 
-    name = "colmap"
+    name, layout, source = "colmap", COLMAP_LAYOUT, "COLMAP's project"
 
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | None = None,
-        model: str | None = None,
-        images: str = "images",
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Sequence[int] = (320, 240),
-    ) -> None:
-        folder = reading.find_sequence(root, "." if sequence is None else sequence, COLMAP_LAYOUT, "COLMAP's project")
-        solved = read_colmap(find_model(folder, model), folder / images)
-        super().__init__(folder, solved, (start, stop, stride), size, _name(folder, sequence))
+    def __post_init__(self) -> None:
+        folder = self._find(self.sequence or ".")
+        self._take(folder, read_colmap(find_model(folder, self.model), folder / self.images))
 
 
+@dataclass(eq=False)
 class Nerfstudio(PosedImages):
-    """A folder with nerfstudio's transforms.json, of one camera.
+    """A folder with nerfstudio's transforms.json, of one camera; sequence None = root itself."""
 
-    Args:
-        sequence: folder below root; None = root itself.
-        start, stop, stride: which of its images, in natural order of their names.
-    """
+    name, layout, source = "nerfstudio", NERFSTUDIO_LAYOUT, "written by ns-process-data and by many apps"
 
-    name = "nerfstudio"
-
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | None = None,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Sequence[int] = (320, 240),
-    ) -> None:
-        what = "written by ns-process-data and by many apps"
-        folder = reading.find_sequence(root, "." if sequence is None else sequence, NERFSTUDIO_LAYOUT, what)
-        solved = read_nerfstudio(folder / "transforms.json")
-        super().__init__(folder, solved, (start, stop, stride), size, _name(folder, sequence))
-
-
-def _name(folder: Path, sequence: str | None) -> str:
-    return folder.resolve().name if sequence is None else str(sequence)
+    def __post_init__(self) -> None:
+        folder = self._find(self.sequence or ".")
+        self._take(folder, read_nerfstudio(folder / "transforms.json"))
 
 
 def find_model(folder: Path, model: str | None) -> SparseModel:
     """Read a sparse model, of several the largest, or raise an error that names where one was looked for."""
     places = [folder / name for name in (MODEL_FOLDERS if model is None else (model,))]
     for place in places:
-        beside = [place] if model is not None or place.name != "0" else _numbered(place.parent)
-        if there := [other for other in beside if _has_model(other)]:
-            return max(map(load_colmap, there), key=lambda found: len(found.names))
+        beside = [place]
+        if model is None and place.name == "0":  # what COLMAP could not join is in several that are numbered
+            numbered = (path for path in place.parent.glob("*") if path.name.isdecimal())
+            beside = sorted(numbered, key=lambda path: int(path.name))
+        if there := [load_colmap(folder) for folder in beside if is_model(folder)]:
+            return max(there, key=lambda found: len(found.names))
     looked = ", ".join(str(place) for place in places)
     raise FileNotFoundError(f"no cameras and images (.txt or .bin) in {looked}; expected the layout {COLMAP_LAYOUT}")
-
-
-def _has_model(place: Path) -> bool:
-    return any(all((place / name).is_file() for name in names) for names in (TEXT, BINARY))
-
-
-def _numbered(folder: Path) -> list[Path]:
-    """The models that COLMAP numbers: what it could not join is in several, and the first need not be the largest."""
-    found = (path for path in folder.glob("*") if path.name.isdecimal())
-    return sorted(found, key=lambda path: int(path.name))
 
 
 def read_colmap(found: SparseModel, folder: Path) -> Solved:

@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import open3d as o3d
@@ -13,7 +14,7 @@ from emgs_jax.data import reading
 from emgs_jax.data.base import STAYS, Frame
 from emgs_jax.data.furniture import Part
 from emgs_jax.data.looks import Looks, draw_looks, paint
-from emgs_jax.data.movers import Mover
+from emgs_jax.data.movers import Lane, Mover, build_movers
 from emgs_jax.data.reading import Number
 
 FOCAL_PER_WIDTH = 0.82  # 63 degrees across, as a Kinect
@@ -27,42 +28,56 @@ class Scene:
     looks: Looks
 
 
+@dataclass(eq=False)
 class RayCast:
     """A data set whose frames are cast when they are asked for: each depends on its pose only, not on those before.
 
-    A built-in scene is a subclass that names itself, its classes and its version, and builds what follows.
-
-    Args:
-        sequence: name of the scene and of the path through it.
-        scene: what the rays meet; it must enclose all poses.
-        poses: T_world_camera of all images along the path.
-        numbers: which of these images are in use.
-        size: (width, height).
-        intrinsics: fx, fy, cx, cy at `size`; None = .82 times the width and the centre.
-        movers: what moves in it, with a place for each image along the path.
+    A built-in scene is a subclass that names itself, its classes and its version, and says what to `_show`.
     """
 
-    name: str
-    classes: tuple[str, ...]
-    version: int  # goes up with every change of geometry, texture or path: recorded predictions then no longer fit
+    seed: int = 0  # of all that is drawn, 0 or more
+    num_frames: int | None = None  # images along the path, which stays the same: more frames are nearer to each other
+    # start, stop, stride: which of these images are in use
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+    size: Sequence[int] = (320, 240)  # (width, height)
+    intrinsics: Sequence[Number] | None = None  # fx, fy, cx, cy at `size`; None = .82 times the width and the centre
+    movers: int = 0  # how many things move, see `build_movers`
+
+    name: ClassVar[str]
+    classes: ClassVar[tuple[str, ...]]
+    # Goes up with every change of geometry, texture or path: recorded predictions then no longer fit.
+    version: ClassVar[int]
     has_ground_truth = True
 
-    def __init__(
-        self,
-        sequence: str,
-        scene: Scene,
-        poses: Float[np.ndarray, "n 4 4"],
-        numbers: range,
-        size: Sequence[int],
-        intrinsics: Sequence[Number] | None,
-        movers: Sequence[Mover] = (),
+    def __post_init__(self) -> None:
+        if self.seed < 0 or self.movers < 0 or (self.num_frames is not None and self.num_frames < 1):
+            raise ValueError(
+                "dataset.seed must be 0 or more (dataset.movers likewise) and dataset.num_frames 1 or more, got "
+                f"{self.seed}, {self.movers}, {self.num_frames}"
+            )
+
+    def _things(self, lane: Lane) -> list[Mover]:
+        return build_movers(self.movers, lane, np.random.default_rng((self.seed, 1)))
+
+    def _show(
+        self, sequence: str, scene: Scene, poses: Float[np.ndarray, "n 4 4"], movers: Sequence[Mover] = ()
     ) -> None:
-        self.sequence, self.parts = sequence, scene.parts
-        self._looks, self._poses, self._numbers = scene.looks, poses, numbers
-        self.size = reading.check_size(size)
-        w, h = self.size
+        """Set what is cast.
+
+        Args:
+            sequence: name of the scene and of the path through it.
+            scene: what the rays meet; it must enclose all poses.
+            poses: T_world_camera of all images along the path.
+            movers: what moves in it, with a place for each image along the path.
+        """
+        self._numbers = reading.select(len(poses), self.start, self.stop, self.stride, f"{self.name} {sequence}")
+        self.sequence, self.parts, self._looks, self._poses = sequence, scene.parts, scene.looks, poses
+        self.size = w, h = reading.check_size(self.size)
         default = (FOCAL_PER_WIDTH * w, FOCAL_PER_WIDTH * w, (w - 1) / 2, (h - 1) / 2)
-        self.intrinsics = reading.check_intrinsics(default if intrinsics is None else intrinsics, self.size)
+        given = default if self.intrinsics is None else self.intrinsics
+        self.intrinsics = reading.check_intrinsics(given, self.size)
         self.calibration = {"source": "rendered", "size": [w, h], "intrinsics": [*self.intrinsics], "distortion": []}
         moving = [mover.part for mover in movers]
         self._movers, self._moving_looks = movers, draw_looks(moving, np.random.default_rng(len(moving)))

@@ -50,12 +50,9 @@ class ReadableFrames:
             raise ValueError(f"on_bad_frame must be error or skip, got {on_bad_frame!r}")
         self._dataset, self._checksums = dataset, find_checksums(checksums, dataset)
         self._spool, self._places = Spool(), {}  # of each frame that was read, the rest of it and where its arrays are
-        self.name, self.sequence, self.size = dataset.name, dataset.sequence, dataset.size
-        self.intrinsics, self.calibration, self.classes = dataset.intrinsics, dataset.calibration, dataset.classes
-        self.has_ground_truth, self.full_intrinsics = (
-            dataset.has_ground_truth,
-            getattr(dataset, "full_intrinsics", None),
-        )
+        for name in ("name", "sequence", "size", "intrinsics", "calibration", "classes", "has_ground_truth"):
+            setattr(self, name, getattr(dataset, name))
+        self.full_intrinsics = getattr(dataset, "full_intrinsics", None)
         self._masks, self._names = masks, () if masks.folder is None else names_of(dataset)
         masks.check(self._names)
         if masks.folder is not None and any(dataset.calibration.get("distortion") or ()):

@@ -4,15 +4,17 @@ import hashlib
 import math
 import struct
 import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from PIL import ExifTags, Image
+from scipy.spatial.transform import Rotation
 
-from emgs_jax.data.base import BadFrameError, Dataset
+from emgs_jax.data.base import BadFrameError
 
 Number = int | float  # a YAML value may be written 585 or 585.0
 Size = tuple[int, int]  # (width, height)
@@ -58,9 +60,7 @@ def select(count: int, start: int, stop: int | None, stride: int, where: object)
     if not 0 <= start < count:
         raise ValueError(f"dataset.start must be in 0..{count - 1}, {where} has {count} images; got {start}")
     if stop is not None and not start < stop <= count:
-        raise ValueError(
-            f"dataset.stop must be null (all) or in {start + 1}..{count}, {where} has {count} images; got {stop}"
-        )
+        raise ValueError(f"dataset.stop must be null (all) or in {start + 1}..{count}, of {where}; got {stop}")
     return range(start, count if stop is None else stop, stride)
 
 
@@ -287,12 +287,14 @@ def check_raw_size(image: np.ndarray, raw_size: Size | None, path: object) -> No
         )
 
 
-def first_size(paths: Iterable[Path], where: object, flags: int = 0) -> Size:
-    """(width, height) of the first image that can be read, as `read_color` does."""
+def first_size(
+    images: Iterable[Any], where: object, flags: int = 0, read: Callable[[Any], np.ndarray] | None = None
+) -> Size:
+    """(width, height) of the first image that can be read; `where` names them all; None = files as of `read_color`."""
     reasons = []
-    for path in paths:
+    for image in images:
         try:
-            return decode(path, OWN_BITS | flags).shape[1::-1]
+            return (decode(image, OWN_BITS | flags) if read is None else read(image)).shape[1::-1]
         except BadFrameError as error:
             reasons.append(str(error))
     raise ValueError(f"{where}: none of its {len(reasons)} images can be read: {'; '.join(dict.fromkeys(reasons[:3]))}")
@@ -300,36 +302,24 @@ def first_size(paths: Iterable[Path], where: object, flags: int = 0) -> Size:
 
 def transparency_note(paths: Iterable[Path]) -> str | None:
     """Words where an image is transparent in places, about the first such; files that cannot be read are left out."""
-    return next((note for path in paths if _may_be_transparent(path) and (note := _transparency(path))), None)
-
-
-def _head(path: Path) -> bytes:
-    """The first bytes of a file, with the header and the tables of a PNG; none where it cannot be read."""
-    try:
-        with open(path, "rb") as file:
-            return file.read(2048)
-    except OSError:
-        return b""
+    return next((note for path in paths if (note := _transparency(path))), None)
 
 
 def may_be_deep(path: Path) -> bool:
     """Test by its first bytes whether an image may have more than 8 bits; only these are decoded to look."""
-    head = _head(path)
-    return head[24:25] == b"\x10" if head.startswith(b"\x89PNG") else not head.startswith(EIGHT_BITS)
-
-
-def _may_be_transparent(path: Path) -> bool:
-    """Test likewise whether a file may have an alpha channel, or a colour that stands for nothing (a PNG's tRNS)."""
-    head = _head(path)
-    if head.startswith(b"\x89PNG"):
-        return head[25:26] in (b"\x04", b"\x06") or b"tRNS" in head.partition(b"IDAT")[0]
-    return not head.startswith((b"\xff\xd8", b"BM"))
+    try:
+        with open(path, "rb") as file:
+            head = file.read(25)
+    except OSError:
+        return True
+    return head[24:] == b"\x10" if head.startswith(b"\x89PNG") else not head.startswith(EIGHT_BITS)
 
 
 def _transparency(path: Path) -> str | None:
     try:
         with Image.open(path) as image:
-            if image.mode == "F" or image.convert("RGBA").getchannel("A").getextrema()[0] >= 255:
+            has_some = "A" in image.getbands() or "transparency" in image.info
+            if not has_some or image.convert("RGBA").getchannel("A").getextrema()[0] >= 255:
                 return None
     except (OSError, ValueError, SyntaxError):  # a damaged image, whose turn comes when it is read
         return None
@@ -339,19 +329,12 @@ def _transparency(path: Path) -> str | None:
     )
 
 
-def as_pose(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
-    """`as_motion`; ValueError where it is farther away than positions can be held."""
-    pose = as_motion(text, where)
-    if pose is not None:
-        check_position(pose[:3, 3], where)
-    return pose
-
-
-def as_motion(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
+def as_pose(text: str, where: object, may_be_far: bool = False) -> Float[np.ndarray, "4 4"] | None:
     """A rigid 4x4 transform from 16 numbers, row by row; None where they are inf or nan, which means lost tracking.
 
     Raises:
         BadFrameError: they are no pose.
+        ValueError: it is farther away than positions can be held.
     """
     try:
         pose = np.array([float(token) for token in text.split()], np.float64).reshape(4, 4)
@@ -367,12 +350,21 @@ def as_motion(text: str, where: object) -> Float[np.ndarray, "4 4"] | None:
                 "columns by it, and give depth and positions in one unit"
             )
         if scale < 0 and is_rigid(pose * np.where(np.arange(4) == 0, -1.0, 1.0)):
-            raise BadFrameError(
-                f"{where} has a mirrored pose, as where one axis was flipped: flip two of them, or none"
-            )
+            raise BadFrameError(f"{where} has a mirrored pose, as of one axis flipped: flip two of them, or none")
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
     left, _, right = np.linalg.svd(pose[:3, :3])
     pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded
+    if not may_be_far:
+        check_position(pose[:3, 3], where)
+    return pose
+
+
+def rigid(position: Sequence[float], quaternion: Sequence[float]) -> Float[np.ndarray, "4 4"]:
+    """The motion to a position, turned by a quaternion x, y, z, w; ValueError where one is not finite or this not 1."""
+    if not np.isfinite(position).all() or not abs(math.hypot(*quaternion) - 1) <= RIGID_TOLERANCE:
+        raise ValueError("its quaternion has not length 1")
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
     return pose
 
 
@@ -393,11 +385,6 @@ def check_position(position: Float[np.ndarray, " 3"], where: object) -> None:
             f"{where} has a position of [{shown}] m, and a map holds positions in float32 up to {MAX_POSITION_M:g} m: "
             "where the trajectory is geo-referenced subtract one position from all of its lines, else correct this one"
         )
-
-
-def all_files(dataset: Dataset) -> set[Path]:
-    """Return all files that the frames in use are read from."""
-    return {file for index in range(len(dataset)) for file in dataset.files(index)}
 
 
 def fingerprint(root: Path, files: Iterable[Path], options: dict[str, object]) -> str:

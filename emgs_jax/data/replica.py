@@ -3,11 +3,12 @@
 import json
 import re
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
+from jaxtyping import Float
 
 from emgs_jax.data import reading
 from emgs_jax.data.calibration_files import Calibration
@@ -20,66 +21,38 @@ LAYOUT = "root/{cam_params.json, SCENE/{traj.txt, results/{frame000000.jpg, dept
 SOURCE = "Replica as rendered for iMAP and NICE-SLAM, see the NICE-SLAM project page"
 
 
+@dataclass(eq=False)
 class Replica(Straightened):
-    """One rendered sequence of Replica.
+    """One rendered sequence of Replica, such as "office0", below root, which has cam_params.json."""
 
-    Args:
-        root: folder that holds cam_params.json and the scenes.
-        sequence: "office0".
-        start, stop, stride: which of the images that are there, in order.
-        intrinsics: of the images on disk, as `Images` takes them; None = those of cam_params.json.
-        depth_scale: raw units per metre; None = that of cam_params.json.
-    """
+    stride: int = 10
+    size: Sequence[int] = (320, 180)
+    intrinsics: Given | None = None  # of the images on disk, as `Images` takes them; None = those of cam_params.json
+    depth_scale: Number | None = None  # raw units per metre; None = that of cam_params.json
 
-    name = "replica"
+    name, layout, source = "replica", LAYOUT, SOURCE
     has_ground_truth = True
 
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | None = None,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 10,
-        size: Sequence[int] = (320, 180),
-        intrinsics: Given | None = None,
-        depth_scale: Number | None = None,
-    ) -> None:
-        self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
+    def __post_init__(self) -> None:
+        self._folder = self._find(self.sequence)
         images = find_images(self._folder / "results")
-        chosen = reading.select(len(images), start, stop, stride, f"{self._folder / 'results'} (layout {LAYOUT})")
+        chosen = self._select(len(images), f"{self._folder / 'results'} (layout {LAYOUT})")
         self._images = [images[i] for i in chosen]
-        self._poses = read_rows(self._folder / "traj.txt", self._images)
-        path = Path(str(root)).expanduser() / "cam_params.json"
+        self._times = [number_of(path) for path in self._images]
+        self._depths = [depth_path(path) for path in self._images]
+        self._files = (self._folder / "traj.txt",)
+        self._poses = read_rows(self._files[0], self._images)
+        path = Path(str(self.root)).expanduser() / "cam_params.json"
         raw_size, calibration, scale = read_calibration(path)
-        if intrinsics is None:
+        if self.intrinsics is None:
             lens = to_lens(Calibration(calibration, (), raw_size), raw_size, str(path), {"source": path.name})
         else:
-            lens = find_lens(intrinsics, pictures_of(self._images, raw_size))
-        self._use(lens, raw_size, size)
-        self.sequence = str(sequence)
-        self._depth_scale = reading.check_depth_scale(scale if depth_scale is None else depth_scale)
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def _place(self, index: int) -> tuple[float, str]:
-        return float(number_of(self._images[index])), str(self._images[index])
-
-    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        return reading.read_color(self._images[index], self._raw_size)
-
-    def _depth(self, index: int) -> Float32[np.ndarray, "h w"]:
-        depth = reading.read_depth(depth_path(self._images[index]), self._depth_scale, self._raw_size)
-        return reading.resize_nearest(self._lens.straighten_depth(depth), self.size)
+            lens = find_lens(self.intrinsics, pictures_of(self._images, raw_size))
+        self._use(lens, raw_size)
+        self._depth_scale = reading.check_depth_scale(scale if self.depth_scale is None else self.depth_scale)
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
-        number = number_of(self._images[index])
-        return reading.as_pose(self._poses[index], f"{self._folder / 'traj.txt'}, row {number} (from 0),")
-
-    def files(self, index: int) -> list[Path]:
-        image = self._images[index]
-        return [image, depth_path(image), self._folder / "traj.txt"]
+        return reading.as_pose(self._poses[index], f"{self._files[0]}, row {self._times[index]} (from 0),")
 
     def _options(self) -> dict[str, Any]:
         return {"depth_scale": self._depth_scale}

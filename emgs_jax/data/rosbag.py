@@ -3,6 +3,7 @@
 import re
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,61 +20,46 @@ from emgs_jax.data.tones import ALL_16_BITS, find_tones
 
 LAYOUT = "root[/sequence] = a .bag of ROS 1, or the folder of a ROS 2 bag with metadata.yaml"
 RAW, COMPRESSED, INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
-TO_RGB = {"rgb8": None, "bgr8": cv2.COLOR_BGR2RGB, "mono8": cv2.COLOR_GRAY2RGB}
-TO_RGB |= {"rgba8": cv2.COLOR_RGBA2RGB, "bgra8": cv2.COLOR_BGRA2RGB, "mono16": cv2.COLOR_GRAY2RGB}
-# What OpenCV's programs publish where nobody says the encoding: its own order of colours.
-TO_RGB |= {"8UC1": cv2.COLOR_GRAY2RGB, "8UC3": cv2.COLOR_BGR2RGB, "8UC4": cv2.COLOR_BGRA2RGB}
-CHANNELS = {"rgb8": 3, "bgr8": 3, "mono8": 1, "rgba8": 4, "bgra8": 4, "mono16": 1, "8UC1": 1, "8UC3": 3, "8UC4": 4}
+# Channels of an encoding, and OpenCV's conversion to RGB. 8UC… is what OpenCV's programs publish where nobody says the
+# encoding: its own order of colours.
+ENCODINGS = {"rgb8": (3, None), "bgr8": (3, cv2.COLOR_BGR2RGB), "8UC3": (3, cv2.COLOR_BGR2RGB)}
+ENCODINGS |= {"rgba8": (4, cv2.COLOR_RGBA2RGB), "bgra8": (4, cv2.COLOR_BGRA2RGB), "8UC4": (4, cv2.COLOR_BGRA2RGB)}
+ENCODINGS |= dict.fromkeys(("mono8", "mono16", "8UC1"), (1, cv2.COLOR_GRAY2RGB))
 DEPTHS = re.compile(r"(16|32|64)[USF]C[1-4]$")  # also where they are compressed, as if they were pictures
 RECTIFIED = re.compile(r"(^|[/_])rect([/_]|$)")  # a topic, as image_proc and others name it
 
 
+@dataclass(eq=False)
 class RosBag(Straightened):
-    """The images of one topic.
+    """The images of one topic of the bag root or root/sequence, in the order in which they were taken."""
 
-    Args:
-        sequence: bag below root; None = root itself.
-        topic: of sensor_msgs/Image or CompressedImage; None = the only one.
-        info_topic: of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one.
-        intrinsics: as `Images` takes them; None = those of the first CameraInfo.
-        start, stop, stride: which of the images, in the order in which they were taken.
-    """
+    topic: str | None = None  # of sensor_msgs/Image or CompressedImage; None = the only one
+    info_topic: str | None = None  # of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one
+    intrinsics: Given | None = None  # as `Images` takes them; None = those of the first CameraInfo
 
-    name = "rosbag"
+    name, layout, source = "rosbag", LAYOUT, "ros2 bag record"
 
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | None = None,
-        topic: str | None = None,
-        info_topic: str | None = None,
-        intrinsics: Given | None = None,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Sequence[int] = (320, 240),
-    ) -> None:
-        self._path = reading.find_sequence(root, "." if sequence is None else sequence, LAYOUT, "ros2 bag record")
+    def __post_init__(self) -> None:
+        self._path = self._find(self.sequence or ".")
+        self._folder = self._path.parent
         with _opened(self._path) as bag:
-            self._topic = _topic_of(bag, (RAW, COMPRESSED), topic, self._path, "topic")
+            self._topic = _topic_of(bag, (RAW, COMPRESSED), self.topic, self._path, "topic")
             received, stamps = _times(bag, self._topic)
-            info = None if intrinsics is not None else _camera_info(bag, self._topic, info_topic, self._path)
+            info = None if self.intrinsics is not None else _camera_info(bag, self._topic, self.info_topic, self._path)
         first: dict[int, int] = {}  # several may have one time
         places = [(time, row - first.setdefault(time, row)) for row, time in enumerate(received)]
         taken, note = when_taken(received, stamps)
         order = sorted(range(len(taken)), key=lambda row: taken[row])
-        chosen = reading.select(len(order), start, stop, stride, f"{self._path}, topic {self._topic},")
+        chosen = self._select(len(order), f"{self._path}, topic {self._topic},")
         self._places = [places[order[place]] for place in chosen]
         self._taken = [taken[order[place]] for place in chosen]
         self._tones = find_tones(self._picture, len(self))
-        raw_size = self._first_size()
+        raw_size = reading.first_size(range(len(self)), f"{self._path}, topic {self._topic},", read=self._shown)
         if info is None:
-            lens = find_lens(intrinsics, Pictures(raw_size, len(self), self._shown))
+            lens = find_lens(self.intrinsics, Pictures(raw_size, len(self), self._shown))
         else:
             lens = to_lens(info, raw_size, f"CameraInfo of {self._path}", {"source": "CameraInfo"})
-        self._use(lens, raw_size, size, note)
-        self._folder = self._path.parent
-        self.sequence = self._path.resolve().name if sequence is None else str(sequence)
+        self._use(lens, raw_size, note)
 
     def __len__(self) -> int:
         return len(self._places)
@@ -94,14 +80,6 @@ class RosBag(Straightened):
 
     def _fingerprinted(self) -> list[Path]:
         return self.files(0)  # the same for all
-
-    def _first_size(self) -> reading.Size:
-        for index in range(len(self)):
-            try:
-                return self._shown(index).shape[1::-1]
-            except BadFrameError as error:
-                last = error
-        raise ValueError(f"none of the images of {self._topic} can be read: {last}")
 
     def _shown(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         return (self._tones or ALL_16_BITS).shown(self._picture(index))
@@ -152,10 +130,10 @@ def to_rgb(message: Any, is_compressed: bool, label: str) -> np.ndarray:
     """
     encoding = str(message.format).partition(";")[0].strip() if is_compressed else str(message.encoding)
     is_depth = DEPTHS.match(encoding) is not None or (is_compressed and "compressedDepth" in str(message.format))
-    if is_depth or (not is_compressed and encoding not in CHANNELS):
+    if is_depth or (not is_compressed and encoding not in ENCODINGS):
         what = " (depths)" if is_depth else ""
         raise BadFrameError(
-            f"{label} has the encoding {encoding[:40]!r}{what}, and read are {', '.join(CHANNELS)}: "
+            f"{label} has the encoding {encoding[:40]!r}{what}, and read are {', '.join(ENCODINGS)}: "
             "choose another dataset.topic, such as the rectified one"
         )
     if is_compressed:
@@ -164,15 +142,15 @@ def to_rgb(message: Any, is_compressed: bool, label: str) -> np.ndarray:
         if image is None:
             raise BadFrameError(f"{label} is damaged: record it again, or set on_bad_frame=skip")
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-    dtype = np.dtype(np.uint16 if message.encoding == "mono16" else np.uint8)
+    dtype = np.dtype(np.uint16 if encoding == "mono16" else np.uint8)
     dtype = dtype.newbyteorder(">" if message.is_bigendian else "<")
-    width = message.width * CHANNELS[message.encoding] * dtype.itemsize
+    channels, code = ENCODINGS[encoding]
+    width = message.width * channels * dtype.itemsize
     if message.step < width or len(message.data) != message.step * message.height or not message.height * width:
         raise BadFrameError(f"{label} is not as large as it says: record it again, or set on_bad_frame=skip")
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)[:, :width]
     image = np.ascontiguousarray(rows).view(dtype).astype(dtype.newbyteorder("="), copy=False)
     image = image.reshape(message.height, message.width, -1)
-    code = TO_RGB[message.encoding]
     return image if code is None else cv2.cvtColor(image, code)
 
 

@@ -1,13 +1,13 @@
 """7-Scenes: hand-held Kinect, SCENE/seq-XX/frame-%06d.{color.png|jpg, depth.png, pose.txt}."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float, Float32, UInt8
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float, Float32
 
 from emgs_jax.data import reading
 from emgs_jax.data.backprojection import backproject
@@ -34,83 +34,60 @@ FOOTPRINT_MARGIN = 1.2  # slanted surfaces spread: a little overlap leaves no ho
 NEAR = 0.05  # metres; nothing the sensor measures is nearer
 
 
+@dataclass(eq=False)
 class SevenScenes(Straightened):
-    """One sequence of 7-Scenes.
+    """One sequence of 7-Scenes, "SCENE/seq-XX"."""
 
-    Args:
-        sequence: "SCENE/seq-XX".
-        start, stop, stride: which of the images that are there, in order.
-        intrinsics: of the 640x480 colour images, as `Images` takes them; None = 525 when registered, else 585.
-        depth_scale: raw units per metre.
-        register_depth: warp depth into the colour camera and give its pose; else depth and pose are the depth camera's.
-        poses: file with the true poses, in place of the release's, see `read_poses`.
-    """
+    stride: int = 10
+    # of the 640x480 colour images, as `Images` takes them; None = 525 when registered, else 585
+    intrinsics: Given | None = None
+    depth_scale: Number = 1000.0  # raw units per metre
+    # warp depth into the colour camera and give its pose; else depth and pose are the depth camera's
+    register_depth: bool = True
+    poses: str | None = None  # file with the true poses, in place of the release's, see `read_poses`
 
-    name = "seven_scenes"
+    name, layout, source = "seven_scenes", LAYOUT, SOURCE
     has_ground_truth = True
 
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | None = None,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 10,
-        size: Sequence[int] = (320, 240),
-        intrinsics: Given | None = None,
-        depth_scale: Number = 1000.0,
-        register_depth: bool = True,
-        poses: str | None = None,
-    ) -> None:
-        self._folder = reading.find_sequence(root, sequence, LAYOUT, SOURCE)
+    def __post_init__(self) -> None:
+        self._folder = self._find(self.sequence)
         images = find_images(self._folder)
-        chosen = reading.select(len(images), start, stop, stride, f"{self._folder} (layout {LAYOUT})")
-        self._images = [images[i] for i in chosen]
-        self.sequence = str(sequence)
-        self._depth_scale = reading.check_depth_scale(depth_scale)
-        self._register = bool(register_depth)
-        default = COLOR_INTRINSICS if register_depth else DEPTH_INTRINSICS
-        given = default if intrinsics is None else intrinsics
-        self._use(find_lens(given, pictures_of(self._images, RAW_SIZE)), RAW_SIZE, size)
-        if self._lens.maps is not None and not self._register:
+        self._images = [images[i] for i in self._select(len(images), f"{self._folder} (layout {LAYOUT})")]
+        self._times = [frame_number(path) for path in self._images]
+        self._depths = [sibling(path, "depth.png") for path in self._images]
+        self._depth_scale = reading.check_depth_scale(self.depth_scale)
+        default = COLOR_INTRINSICS if self.register_depth else DEPTH_INTRINSICS
+        given = default if self.intrinsics is None else self.intrinsics
+        self._use(find_lens(given, pictures_of(self._images, RAW_SIZE)), RAW_SIZE)
+        if self._lens.maps is not None and not self.register_depth:
             raise ValueError(
                 "dataset.intrinsics with distortion is the colour camera's, but with dataset.register_depth=false the "
                 "depth is another camera's, which it does not straighten: set dataset.register_depth=true"
             )
-        self._poses_file = None if poses is None else Path(poses).expanduser()
+        self._poses_file = None if self.poses is None else Path(self.poses).expanduser()
         self._poses = None if self._poses_file is None else read_poses(self._poses_file, self._folder.name)
 
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def _place(self, index: int) -> tuple[float, str]:
-        return frame_number(self._images[index]), str(self._images[index])
-
-    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        return reading.read_color(self._images[index], RAW_SIZE)
-
     def _depth(self, index: int) -> Float32[np.ndarray, "h w"]:
-        depth = reading.read_depth(sibling(self._images[index], "depth.png"), self._depth_scale, RAW_SIZE)
-        is_registered = self._register
-        return (
-            register(depth, self.intrinsics, self.size) if is_registered else reading.resize_nearest(depth, self.size)
+        if not self.register_depth:
+            return super()._depth(index)
+        return register(
+            reading.read_depth(self._depths[index], self._depth_scale, RAW_SIZE), self.intrinsics, self.size
         )
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
         if self._poses is not None:
-            T_world_color = self._poses.get(frame_number(self._images[index]))
-            return T_world_color if self._register or T_world_color is None else T_world_color @ T_COLOR_DEPTH
+            T_world_color = self._poses.get(self._times[index])
+            return T_world_color if self.register_depth or T_world_color is None else T_world_color @ T_COLOR_DEPTH
         path = sibling(self._images[index], "pose.txt")
         T_world_depth = reading.as_pose(reading.read_text(path), path) if path.exists() else None
-        is_moved = self._register and T_world_depth is not None
+        is_moved = self.register_depth and T_world_depth is not None
         return T_world_depth @ np.linalg.inv(T_COLOR_DEPTH) if is_moved else T_world_depth
 
     def files(self, index: int) -> list[Path]:
-        image = self._images[index]
-        return [image, sibling(image, "depth.png"), sibling(image, "pose.txt")]
+        return [*super().files(index), sibling(self._images[index], "pose.txt")]
 
     def _options(self) -> dict[str, Any]:
-        return {"depth_scale": self._depth_scale, "register_depth": self._register}
+        return {"depth_scale": self._depth_scale, "register_depth": bool(self.register_depth)}
 
     def _fingerprinted(self) -> Iterable[Path]:
         return [*super()._fingerprinted(), *filter(None, [self._poses_file])]
@@ -125,12 +102,8 @@ def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"
     of pseudo ground truth in visual camera re-localisation", ICCV 2021), in lines "seq-XX/frame-000000.color.png qw qx
     qy qz tx ty tz focal", world -> colour camera; # begins a comment.
 
-    Args:
-        sequence: seq-XX; lines of other sequences are left out.
-
-    Raises:
-        BadFrameError: a line is none.
-        ValueError: no line is of the sequence.
+    Lines of other sequences than `sequence` are left out; BadFrameError where a line is none, ValueError where none is
+    of the sequence.
     """
     found = {}
     for row, line in enumerate(reading.read_text(path).splitlines(), start=1):
@@ -141,13 +114,10 @@ def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"
             w, x, y, z, *translation = (float(number) for number in numbers[:7])
             if not np.isfinite([w, x, y, z, *translation]).all():  # the camera was lost there
                 continue
-            T_camera_world = np.eye(4)
-            T_camera_world[:3, :3] = Rotation.from_quat([x, y, z, w]).as_matrix()
-            T_camera_world[:3, 3] = translation
+            T_world_camera = np.linalg.inv(reading.rigid(translation, (x, y, z, w)))
         except ValueError as error:
             form = "seq-XX/frame-000000.color.png qw qx qy qz tx ty tz focal"
             raise BadFrameError(f"{path} line {row} is no pose of the form {form}: {reading.REMEDY}") from error
-        T_world_camera = np.linalg.inv(T_camera_world)
         reading.check_position(T_world_camera[:3, 3], path)
         found[frame_number(Path(name))] = T_world_camera
     if not found:
@@ -182,7 +152,10 @@ def register(depth: Float32[np.ndarray, "_ _"], intrinsics: Intrinsics, size: Si
     Every source pixel is a square that covers the target pixels whose centres lie in it; the nearest surface wins, and
     of that the mean inverse depth: the nearest square alone is before a slanted surface.
     """
-    points = color_camera_points(depth)
+    points = backproject(depth, DEPTH_INTRINSICS)[depth > NEAR]
+    # einsum, as a threaded matmul of this shape waits for its threads when the machine is busy
+    points = np.einsum("pj,ij->pi", points, T_COLOR_DEPTH[:3, :3]) + T_COLOR_DEPTH[:3, 3]
+    points = points[points[:, 2] > NEAR]  # in the colour camera's axes
     (fx, fy, cx, cy), (w, h) = intrinsics, size
     u, v, z = fx * points[:, 0] / points[:, 2] + cx, fy * points[:, 1] / points[:, 2] + cy, points[:, 2]
     half_u, half_v = (0.5 * FOOTPRINT_MARGIN * f / g for f, g in zip((fx, fy), DEPTH_INTRINSICS[:2], strict=True))
@@ -200,11 +173,3 @@ def register(depth: Float32[np.ndarray, "_ _"], intrinsics: Intrinsics, size: Si
     pixels, inverse = pixels[is_front], 1.0 / depths[is_front]
     count, total = np.bincount(pixels, minlength=h * w), np.bincount(pixels, inverse, minlength=h * w)
     return np.where(count > 0, count / np.where(count > 0, total, 1.0), 0.0).astype(np.float32).reshape(h, w)
-
-
-def color_camera_points(depth: Float32[np.ndarray, "h w"]) -> Float[np.ndarray, "p 3"]:
-    """Points of the valid pixels of the depth camera in the colour camera's axes, metres."""
-    points = backproject(depth, DEPTH_INTRINSICS)[depth > NEAR]
-    # einsum, as a threaded matmul of this shape waits for its threads when the machine is busy
-    points = np.einsum("pj,ij->pi", points, T_COLOR_DEPTH[:3, :3]) + T_COLOR_DEPTH[:3, 3]
-    return points[points[:, 2] > NEAR]

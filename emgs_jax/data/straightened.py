@@ -1,6 +1,7 @@
-"""Base of the data sets on disk: their images straightened, in the size in use."""
+"""Base of the data sets on disk: the images in use, straightened and in the size in use, and what goes with them."""
 
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,25 +12,51 @@ from emgs_jax.data import reading
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.intrinsics import Lens, with_notes
 from emgs_jax.data.reading import Size
-from emgs_jax.data.tones import Tones
+from emgs_jax.data.tones import read_shown
 
 
+@dataclass(eq=False)
 class Straightened(Dataset):
-    """Frames whose images are read, straightened by one lens and resized; the rest of them where a subclass has it.
+    """Frames whose images are read, straightened by one lens and resized, with depths where there are some.
 
-    A subclass sets `sequence`, `_folder` (of the files) and, where there is one, `_tones`, calls `_use`, and defines
-    `__len__`, `_read`, `_place` and `files`.
+    A subclass is a dataclass with its options. It calls `_find`, `_select` and `_use`, and sets `_folder` (which names
+    of files are relative to in the fingerprint), `_images`, `_times` and what else is set below.
     """
 
-    _folder: Path
-    _tones: Tones | None = None
+    root: str | None = None  # folder of the data set
+    sequence: str | None = None  # folder below root; where a subclass allows it, None = root itself
+    # start, stop, stride: which of the images that are there, in their order
+    start: int = 0
+    stop: int | None = None
+    stride: int = 1
+    # (width, height) of the frames given out; another aspect than the images' is allowed (fx and fy follow)
+    size: Sequence[int] = (320, 240)
 
-    def _use(self, lens: Lens, raw_size: Size, size: Sequence[int], *notes: str | None) -> None:
-        """Straighten by `lens` what is `raw_size` on disk, and give it out in `size`; `notes` are on the images."""
-        self._lens, self._raw_size, self.size = lens, raw_size, reading.check_size(size)
+    layout = source = ""  # for messages: what stands where, and where it comes from
+    _tones = None  # of images with more than 8 bits
+    _flags = 0  # of OpenCV's decoder
+    _depths = None  # file of each image, None where an image has none; None without depths
+    _depth_scale = 1.0  # raw units per metre
+    _files = ()  # that all frames depend on
+
+    def _find(self, sequence: str | None) -> Path:
+        """The folder or file that is asked for, after which the sequence is called if it has no name."""
+        found = reading.find_sequence(self.root, sequence, self.layout, self.source)
+        self.sequence = found.resolve().name if self.sequence is None else str(self.sequence)
+        return found
+
+    def _select(self, count: int, where: object) -> range:
+        return reading.select(count, self.start, self.stop, self.stride, where)
+
+    def _use(self, lens: Lens, raw_size: Size, *notes: str | None) -> None:
+        """Straighten by `lens` what is `raw_size` on disk; `notes` are on the images."""
+        self._lens, self._raw_size, self.size = lens, raw_size, reading.check_size(self.size)
         self.calibration = with_notes(lens.about, self._tones and self._tones.note, *notes)
         self.full_intrinsics = lens.intrinsics
         self.intrinsics = reading.resize_intrinsics(lens.intrinsics, raw_size, self.size)
+
+    def __len__(self) -> int:
+        return len(self._images)
 
     def __getitem__(self, index: int) -> Frame:
         reading.check_index(index, len(self))
@@ -40,6 +67,10 @@ class Straightened(Dataset):
     def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         return self._lens.straighten(self._read(index))
 
+    def files(self, index: int) -> list[Path]:
+        depth = None if self._depths is None else self._depths[index]
+        return [self._images[index], *([] if depth is None else [depth]), *self._files]
+
     def fingerprint(self) -> str:
         options = {"dataset": self.name, "size": self.size, "intrinsics": self.intrinsics} | self._options()
         options |= {} if self._tones is None else {"tones": self._tones}
@@ -47,14 +78,19 @@ class Straightened(Dataset):
 
     def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         """The image as it is on disk, RGB."""
-        raise NotImplementedError
+        return read_shown(self._images[index], self._raw_size, self._tones, self._flags)
 
     def _place(self, index: int) -> tuple[float, str]:
         """Time and name of a frame."""
-        raise NotImplementedError
+        return float(self._times[index]), str(self._images[index])
 
     def _depth(self, index: int) -> Float32[np.ndarray, "h w"] | None:
-        return None
+        if self._depths is None:
+            return None
+        if self._depths[index] is None:
+            return np.zeros(self.size[::-1], np.float32)
+        raw = reading.read_depth(self._depths[index], self._depth_scale, self._raw_size)
+        return reading.resize_nearest(self._lens.straighten_depth(raw), self.size)
 
     def _labels_of(self, index: int) -> Int32[np.ndarray, "h w"] | None:
         return None
@@ -65,4 +101,4 @@ class Straightened(Dataset):
 
     def _fingerprinted(self) -> Iterable[Path]:
         """The files whose content counts."""
-        return reading.all_files(self)
+        return {file for index in range(len(self)) for file in self.files(index)}

@@ -1,59 +1,64 @@
 """A furnished room, ray-cast: images with exact depth, poses, labels and normals, from nothing but a seed."""
 
-from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 
-from emgs_jax.data import reading, room
+from emgs_jax.data import furniture
+from emgs_jax.data.furniture import Part
 from emgs_jax.data.looks import draw_looks
-from emgs_jax.data.movers import Doorway, Lane, build_movers
+from emgs_jax.data.movers import Doorway, Lane
 from emgs_jax.data.raycast import RayCast, Scene, level_poses
-from emgs_jax.data.reading import Number
 
 MARGIN = np.array([1.25, 1.05])  # from the walls to the camera's ellipse
 ARC = np.radians(140.0)  # of the round that the camera goes
 
 
+@dataclass(eq=False)
 class Synthetic(RayCast):
-    """The camera goes round the middle of a room and looks across it: about 6.5 cm and 3.6 degrees a frame of 40.
+    """The camera goes round the middle of a room and looks across it: about 6.5 cm and 3.6 degrees a frame of 40."""
 
-    Args:
-        seed: room, furniture, colours and path.
-        num_frames: images along the path, which stays the same: more frames are nearer to each other.
-        intrinsics: fx, fy, cx, cy at `size`; None = .82 times the width and the centre.
-        movers: how many things move, see `build_movers`.
-    """
+    num_frames: int = 40
 
-    name = "synthetic"
-    classes = room.CLASSES
-    version = 1
+    name, classes, version = "synthetic", furniture.CLASSES, 1
 
-    def __init__(
-        self,
-        seed: int = 0,
-        num_frames: int = 40,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 1,
-        size: Sequence[int] = (320, 240),
-        intrinsics: Sequence[Number] | None = None,
-        movers: int = 0,
-    ) -> None:
-        if seed < 0 or num_frames < 1 or movers < 0:
-            raise ValueError(
-                "dataset.seed must be 0 or more (dataset.movers likewise) and dataset.num_frames 1 or more, got "
-                f"{seed}, {movers}, {num_frames}"
-            )
-        sequence = f"room{seed}"
-        numbers = reading.select(num_frames, start, stop, stride, f"{self.name} {sequence}")
-        rng = np.random.default_rng(seed)
-        parts, room_size = room.build_room(rng)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        rng = np.random.default_rng(self.seed)
+        parts, room_size = build_room(rng)
         scene = Scene(parts, draw_looks(parts, rng))
-        poses = camera_path(num_frames, room_size, rng)
-        lane = lane_around(room_size, poses[:, :2, 3])
-        things = build_movers(movers, lane, np.random.default_rng((seed, 1)))
-        super().__init__(sequence, scene, poses, numbers, size, intrinsics, things)
+        poses = camera_path(self.num_frames, room_size, rng)
+        self._show(f"room{self.seed}", scene, poses, self._things(lane_around(room_size, poses[:, :2, 3])))
+
+
+def build_room(rng: np.random.Generator) -> tuple[list[Part], Float[np.ndarray, " 3"]]:
+    """Objects of a random room as (class, mesh) and its size x, y, z in metres; the origin is the floor's centre."""
+    size = np.array([5.0, 4.0, 2.6]) * rng.uniform(0.95, 1.05, 3)
+    parts = _shell(size) + furniture.table_with_chairs(rng)
+    walls = rng.permutation(4).tolist()
+    for wall, build in zip(walls, (furniture.sofa, furniture.shelf, furniture.cabinet, furniture.desk), strict=True):
+        parts += furniture.against(build(rng), wall, size, rng.uniform(-0.3, 0.3))
+    for wall in range(4):
+        for along in (-0.75, 0.75):
+            if rng.uniform() < 0.8 and not (wall == walls[1] and along < 0):
+                parts += furniture.against(furniture.picture(rng), wall, size, along + rng.uniform(-0.2, 0.2))
+    corners = rng.permutation(4).tolist()
+    for corner, build in zip(corners, (furniture.lamp, furniture.boxes, furniture.ball), strict=False):
+        sign = np.array([1 - 2 * (corner & 1), 1 - (corner & 2)])
+        parts += furniture.moved(build(rng), np.array([*(sign * (size[:2] / 2 - 0.38)), 0.0]))
+    return parts, size
+
+
+def _shell(size: Float[np.ndarray, " 3"]) -> list[Part]:
+    (x, y, z), t = size, 0.1
+    parts = furniture.join("floor", furniture.box((x + t, y + t, t), (0, 0, -t))) + furniture.join(
+        "ceiling", furniture.box((x + t, y + t, t), (0, 0, z))
+    )
+    for s in (-1, 1):
+        parts += furniture.join("wall", furniture.box((t, y + t, z), (s * (x + t) / 2, 0, 0)))
+        parts += furniture.join("wall", furniture.box((x + t, t, z), (0, s * (y + t) / 2, 0)))
+    return parts
 
 
 def lane_around(room_size: Float[np.ndarray, " 3"], camera: Float[np.ndarray, "n 2"]) -> Lane:

@@ -24,9 +24,8 @@ def load_transforms(path: Path) -> tuple[list[str], list[list[float]]]:
         names = [frame["file_path"] for frame in frames]
         matrices = [np.array(frame["transform_matrix"], np.float64) for frame in frames]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
-        raise ValueError(
-            f"{path} must hold frames with file_path and transform_matrix, and it does not ({error!r}): export it again"
-        ) from error
+        what = "frames with file_path and transform_matrix"
+        raise ValueError(f"{path} must hold {what}, and it does not ({error!r}): export it again") from error
     if not names:
         raise ValueError(f"{path} has no frames: export it again")
     for name, matrix in zip(names, matrices, strict=True):

@@ -3,12 +3,12 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
+from dataclasses import InitVar, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
-from jaxtyping import Float, Float32, Int32, UInt8
-from scipy.spatial.transform import Rotation
+from jaxtyping import Float, Int32
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
@@ -18,7 +18,7 @@ from emgs_jax.data.labels import LabelFolder, as_unknown
 from emgs_jax.data.reading import Intrinsics, Number
 from emgs_jax.data.straightened import Straightened
 from emgs_jax.data.timestamps import check_tolerance, in_seconds, matched_rows
-from emgs_jax.data.tones import read_shown, tones_of
+from emgs_jax.data.tones import tones_of
 
 LAYOUT = "root/SEQUENCE/{rgb.txt, depth.txt, groundtruth.txt, rgb/, depth/}"
 RAW_SIZE = (640, 480)
@@ -38,96 +38,81 @@ CALIBRATIONS: Calibrations = {
 }
 
 
-class Tum(Straightened):
-    """One sequence in the TUM layout; without depth.txt or groundtruth.txt there is no ground truth.
+@dataclass(eq=False)
+class TumLayout(Straightened):
+    """One sequence in the TUM layout, images of rgb.txt in order of time.
 
-    A colour image without depth near in time stays in use with depth 0 everywhere; one without a pose, or with one of
-    inf or nan, has none. A list that no image has anything of is an error.
-
-    Args:
-        sequence: "rgbd_dataset_freiburg1_desk"; freiburg1, 2 and 3 in the name choose the calibration.
-        start, stop, stride: which of the images in rgb.txt, in order of time.
-        intrinsics: of the images on disk, as `Images` takes them; None = the benchmark's calibration.
-        distortion: k1, k2, p1, p2, k3 that goes with four numbers of `intrinsics`; None = what those say themselves.
-        depth_scale: raw units per metre.
-        max_time_difference: seconds between a colour image and its depth image or pose.
-        labels: folder in the sequence with the true classes of every image, see `LabelFolder`; None = there are none.
-        classes: file in the sequence that names them.
-        unknown: their ids that mean no class, see `LabelFolder`.
+    Without depth.txt or groundtruth.txt there is no ground truth. A colour image without depth near in time stays in
+    use with depth 0 everywhere; one without a pose, or with one of inf or nan, has none. A list that no image has
+    anything of is an error.
     """
+
+    stride: int = 10
+    intrinsics: Given | None = None  # of the images on disk, as `Images` takes them; None = the benchmark's calibration
+    depth_scale: Number = 5000.0  # raw units per metre
+    max_time_difference: Number = 0.02  # seconds between a colour image and its depth image or pose
+
+    layout = LAYOUT
+    calibrations: ClassVar[Calibrations]
+    distortion = None
+
+    def __post_init__(self) -> None:
+        self._folder = self._find(self.sequence)
+        self._lists = {name: self._folder / f"{name}.txt" for name in ("rgb", "depth", "groundtruth")}
+        self._files = (*self._lists.values(),)
+        times, names, lines = read_list(self._lists["rgb"], 2)
+        chosen = self._select(len(times), f"{self._lists['rgb']} (layout {LAYOUT})")
+        self._times, self._images = times[chosen], [find_image(self._folder, names[i][0]) for i in chosen]
+        self._depth_scale = reading.check_depth_scale(self.depth_scale)
+        tolerance = check_tolerance(self.max_time_difference)
+        depths = nearest_lines(self._lists["depth"], 2, self._times, tolerance, "depth")
+        self._depths = depths and [found and find_image(self._folder, found[0][0]) for found in depths]
+        self._poses = nearest_lines(self._lists["groundtruth"], 8, self._times, tolerance, "pose")
+        self.has_ground_truth = self._depths is not None and self._poses is not None
+        is_own = self.intrinsics is None
+        raw_size = RAW_SIZE if is_own else reading.first_size(self._images, self._folder)
+        self._tones = tones_of(self._images)
+        given = find_calibration(self.sequence, self.intrinsics, self.distortion, self.calibrations)
+        lens = find_lens(given, pictures_of(self._images, raw_size, self._tones))
+        self._use(lens, raw_size, back_note(self._lists["rgb"], times, lines), reading.transparency_note(self._images))
+
+    def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
+        if self._poses is None or self._poses[index] is None:
+            return None
+        words, line = self._poses[index]
+        return as_transform(words, f"{self._lists['groundtruth']}, line {line}:")
+
+    def _options(self) -> dict[str, Any]:
+        return {
+            "undistorted": self._lens.maps is not None,
+            "depth_scale": self._depth_scale,
+            "depths": [p and p.name for p in self._depths or ()],
+            "poses": self._poses and [found and found[0] for found in self._poses],
+        }
+
+
+@dataclass(eq=False)
+class Tum(TumLayout):
+    """TUM RGB-D, where freiburg1, 2 and 3 in the sequence's name choose the calibration, and what has its layout."""
+
+    # k1, k2, p1, p2, k3 that goes with four numbers of `intrinsics`; None = what those say themselves
+    distortion: Sequence[Number] | None = None
+    # folder in the sequence with the true classes of every image, see `LabelFolder`; None = there are none
+    labels: str | None = None
+    classes: InitVar[str] = "classes.txt"  # file in the sequence that names them
+    unknown: Sequence[int] | None = None  # their ids that mean no class, see `LabelFolder`
 
     name = "tum"
     source = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
     calibrations = CALIBRATIONS
 
-    def __init__(
-        self,
-        root: str | None = None,
-        sequence: str | None = None,
-        start: int = 0,
-        stop: int | None = None,
-        stride: int = 10,
-        size: Sequence[int] = (320, 240),
-        intrinsics: Given | None = None,
-        distortion: Sequence[Number] | None = None,
-        depth_scale: Number = 5000.0,
-        max_time_difference: Number = 0.02,
-        labels: str | None = None,
-        classes: str = "classes.txt",
-        unknown: Sequence[int] | None = None,
-    ) -> None:
-        self._folder = reading.find_sequence(root, sequence, LAYOUT, self.source)
-        times, names, lines = read_list(self._folder / "rgb.txt", 2)
-        chosen = reading.select(len(times), start, stop, stride, f"{self._folder / 'rgb.txt'} (layout {LAYOUT})")
-        self._times, self._images = times[chosen], [find_image(self._folder, names[i][0]) for i in chosen]
-        self.sequence = str(sequence)
-        self._depth_scale = reading.check_depth_scale(depth_scale)
-        self._pose_lines: list[int] = []
-        self._depths, self._poses = self._associate(check_tolerance(max_time_difference))
-        self.has_ground_truth = self._depths is not None and self._poses is not None
-        given = find_calibration(self.sequence, intrinsics, distortion, self.calibrations)
-        raw_size = RAW_SIZE if intrinsics is None else reading.first_size(self._images, self._folder)
-        self._tones = tones_of(self._images)
-        lens = find_lens(given, pictures_of(self._images, raw_size, self._tones))
-        said = back_note(self._folder / "rgb.txt", times, lines), reading.transparency_note(self._images)
-        self._use(lens, raw_size, size, *said)
+    def __post_init__(self, classes: str) -> None:
+        super().__post_init__()
         self._labels = None
-        if labels is not None:
-            ids = as_unknown(unknown, "dataset.unknown")
-            self._labels = LabelFolder(self._folder / labels, self._folder / classes, ids, "dataset.unknown")
+        if self.labels is not None:
+            ids = as_unknown(self.unknown, "dataset.unknown")
+            self._labels = LabelFolder(self._folder / self.labels, self._folder / classes, ids, "dataset.unknown")
         self.classes = () if self._labels is None else self._labels.names
-
-    def _associate(self, tolerance: float) -> tuple[list[Path | None] | None, list[list[str] | None] | None]:
-        """Per image in use the depth file and the words of the pose nearest in time; None where there is no list."""
-        depths = poses = None
-        if (self._folder / "depth.txt").exists():
-            times, names, _ = read_list(self._folder / "depth.txt", 2)
-            rows = matched_rows(self._times, times, tolerance, ("depth", self._folder / "depth.txt"))
-            depths = [None if row < 0 else find_image(self._folder, names[row][0]) for row in rows]
-        if (self._folder / "groundtruth.txt").exists():
-            path = self._folder / "groundtruth.txt"
-            times, words, lines = read_list(path, 8)
-            rows = matched_rows(self._times, times, tolerance, ("pose", path))
-            poses = [None if row < 0 else words[row] for row in rows]
-            self._pose_lines = [lines[row] for row in rows]
-        return depths, poses
-
-    def __len__(self) -> int:
-        return len(self._images)
-
-    def _place(self, index: int) -> tuple[float, str]:
-        return float(self._times[index]), str(self._images[index])
-
-    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        return read_shown(self._images[index], self._raw_size, self._tones)
-
-    def _depth(self, index: int) -> Float32[np.ndarray, "h w"] | None:
-        if self._depths is None:
-            return None
-        if self._depths[index] is None:
-            return np.zeros(self.size[::-1], np.float32)
-        raw = reading.read_depth(self._depths[index], self._depth_scale, self._raw_size)
-        return reading.resize_nearest(self._lens.straighten_depth(raw), self.size)
 
     def _labels_of(self, index: int) -> Int32[np.ndarray, "h w"] | None:
         if self._labels is None:
@@ -137,25 +122,12 @@ class Tum(Straightened):
         straight = self._lens.straighten_depth((ids + 1).astype(np.float32)).astype(np.int32) - 1
         return reading.resize_nearest(straight, self.size)
 
-    def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
-        words = None if self._poses is None else self._poses[index]
-        if words is None:
-            return None
-        return as_transform(words, f"{self._folder / 'groundtruth.txt'}, line {self._pose_lines[index]}:")
-
     def files(self, index: int) -> list[Path]:
-        lists = [self._folder / name for name in ("rgb.txt", "depth.txt", "groundtruth.txt")]
-        depth = None if self._depths is None else self._depths[index]
         labels = [] if self._labels is None else [self._labels.path(self._images[index]), self._labels.classes]
-        return [self._images[index], *([] if depth is None else [depth]), *labels, *lists]
+        return [*super().files(index), *labels]
 
     def _options(self) -> dict[str, Any]:
-        return {
-            "undistorted": self._lens.maps is not None,
-            "depth_scale": self._depth_scale,
-            "depths": [p and p.name for p in self._depths or ()],
-            "poses": self._poses,
-        } | ({} if self._labels is None else {"classes": self.classes})
+        return super()._options() | ({} if self._labels is None else {"classes": self.classes})
 
 
 def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[list[str]], list[int]]:
@@ -180,6 +152,17 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
         numbers.append(number)
     order = np.argsort(times, kind="stable")
     return in_seconds(np.array(times, np.float64)[order]), [words[i] for i in order], [numbers[i] for i in order]
+
+
+def nearest_lines(
+    path: Path, columns: int, times: Float[np.ndarray, " n"], tolerance: float, what: str
+) -> list[tuple[list[str], int] | None] | None:
+    """Words and line of a `read_list` nearest to each time, None where none is near; None where there is no list."""
+    if not path.exists():
+        return None
+    known, words, lines = read_list(path, columns)
+    rows = matched_rows(times, known, tolerance, (what, path))
+    return [None if row < 0 else (words[row], lines[row]) for row in rows]
 
 
 def back_note(path: Path, times: Float[np.ndarray, " n"], lines: Sequence[int]) -> str | None:
@@ -214,11 +197,11 @@ def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"] | 
         raise BadFrameError(f"{where} {' '.join(words)!r} must be tx ty tz qx qy qz qw: {REMEDY}") from error
     if not np.isfinite(values).all():
         return None
-    if not np.abs(values[3:]).max() < 2 or abs(np.linalg.norm(values[3:]) - 1) > reading.RIGID_TOLERANCE:
-        raise BadFrameError(f"{where} {' '.join(words)!r} is no pose, as its quaternion has not length 1: {REMEDY}")
+    try:
+        pose = reading.rigid(values[:3], values[3:])
+    except ValueError as error:
+        raise BadFrameError(f"{where} {' '.join(words)!r} is no pose, as {error}: {REMEDY}") from error
     reading.check_position(values[:3], where)
-    pose = np.eye(4)
-    pose[:3, :3], pose[:3, 3] = Rotation.from_quat(values[3:]).as_matrix(), values[:3]
     return pose
 
 
@@ -239,7 +222,5 @@ def find_calibration(
     if len(bent) != 5 or not np.isfinite(bent).all():
         raise ValueError(f"dataset.distortion must be [k1, k2, p1, p2, k3], got {list(distortion)}")
     if isinstance(intrinsics, str) or len(intrinsics) != 4:
-        raise ValueError(
-            "dataset.distortion goes with dataset.intrinsics=[fx,fy,cx,cy] only: put it behind them or into the file"
-        )
+        raise ValueError("dataset.distortion goes with dataset.intrinsics=[fx,fy,cx,cy] only: put it behind them")
     return (*intrinsics, *bent)

@@ -9,7 +9,6 @@ import numpy as np
 from jaxtyping import UInt8
 
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.reading import Size
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
 MIN_ASPECT = 0.2  # of a pixel: what is thinner is no format but a damaged header
@@ -22,36 +21,26 @@ class Video:
         stop: frames from there on are not wanted, and not counted; None = all.
 
     Attributes:
-        count: frames that can be read, up to `stop`.
+        times: seconds since the beginning at which the file shows each frame that can be read, up to `stop`.
         notes: where the header announces more frames than there are.
     """
 
-    tones = None  # a decoder gives 8 bits
-
     def __init__(self, path: Path, stop: int | None = None) -> None:
-        self._path, self.folder = path, path.parent
-        self._capture = self._open()
+        self._path, self._capture = path, open_video(path)
         announced = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
-        self._times = _times(self._capture, stop)
-        self.count = self._next = len(self._times)  # _next: number of the frame that the capture gives next
-        if not self.count:
+        self.times = _times(self._capture, stop)
+        count = self._next = len(self.times)  # _next: number of the frame that the capture gives next
+        if not count:
             raise ValueError(self._nothing_decoded())
-        is_short = math.isfinite(announced) and self.count < (announced if stop is None else min(announced, stop))
-        self.notes = [f"{path} announces {announced:.0f} frames, {self.count} can be read"] if is_short else []
+        is_short = math.isfinite(announced) and count < (announced if stop is None else min(announced, stop))
+        self.notes = [f"{path} announces {announced:.0f} frames, {count} can be read"] if is_short else []
         self._aspect = _pixel_aspect(self._capture)
         if self._aspect != 1:
-            (height, width), (_, shown) = self._decoded(0).shape[:2], self.find_size(range(1))[::-1]
+            (height, width), shown = self._decoded(0).shape[:2], self.read(0).shape[1]
             self.notes.append(
                 f"pixels of {path} are {self._aspect:.4g} times as wide as high: its {width}x{height} frames are shown "
                 f"as {shown}x{height}, and intrinsics are of these"
             )
-
-    def _open(self) -> cv2.VideoCapture:
-        capture = cv2.VideoCapture(str(self._path))
-        if not capture.isOpened():
-            reason = damage(self._path) or "no video that OpenCV can open: convert it to mp4 (h264) or to images"
-            raise ValueError(f"{self._path} is {reason}")
-        return capture
 
     def _nothing_decoded(self) -> str:
         code = int(self._capture.get(cv2.CAP_PROP_FOURCC))
@@ -61,9 +50,6 @@ class Video:
             "few): convert it to h264 (ffmpeg -i VIDEO -c:v libx264 NEW.mp4) or to images"
         )
 
-    def find_size(self, rows: range) -> Size:
-        return self.read(rows[0]).shape[1::-1]
-
     def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:
         """The frame as a player shows it, of square pixels."""
         image = self._decoded(row)
@@ -72,7 +58,7 @@ class Video:
 
     def _decoded(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:
         if row < self._next:
-            self._capture, self._next = self._open(), 0
+            self._capture, self._next = open_video(self._path), 0
         while self._next < row and self._capture.grab():
             self._next += 1
         is_read, image = self._capture.read() if self._next == row else (False, None)
@@ -80,21 +66,19 @@ class Video:
             if not self._next:
                 raise ValueError(self._nothing_decoded())
             raise BadFrameError(
-                f"{self.label(row)} cannot be read, the video ends or is damaged after frame {self._next - 1}: "
+                f"{self._path}, frame {row} cannot be read, the video ends or is damaged after frame {self._next - 1}: "
                 f"set dataset.stop={self._next}"
             )
         self._next += 1
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
-    def timestamp(self, row: int) -> float:
-        """Seconds since the beginning, at which the file shows the frame."""
-        return self._times[row]
 
-    def file(self, row: int) -> Path:
-        return self._path
-
-    def label(self, row: int) -> str:
-        return f"{self._path}, frame {row}"
+def open_video(path: Path) -> cv2.VideoCapture:
+    capture = cv2.VideoCapture(str(path))
+    if not capture.isOpened():
+        reason = damage(path) or "no video that OpenCV can open: convert it to mp4 (h264) or to images"
+        raise ValueError(f"{path} is {reason}")
+    return capture
 
 
 def _pixel_aspect(capture: cv2.VideoCapture) -> float:

@@ -82,9 +82,7 @@ def owned(folder: Path) -> Iterator[None]:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
         os.close(descriptor)
-        raise ValueError(
-            f"another program is writing into {folder}: wait until it has ended, or name another folder"
-        ) from error
+        raise ValueError(f"another program is writing into {folder}: wait, or name another folder") from error
     except OSError:  # a file system without locks
         pass
     try:

@@ -29,7 +29,6 @@ def read_npz(
     """Arrays of an .npz as `numpy.savez` writes it, all or those of `names`.
 
     Args:
-        content: of the file, or the open file.
         names: that must be there; None: all that are there.
         optional: that are read beside `names` where they are there.
         may_be_compressed: as `numpy.savez_compressed` writes it.

@@ -32,8 +32,7 @@ def save_gaussians_ply(
         colors: (n, 3), RGB in [0, 1]; written as the zeroth spherical harmonic.
         opacity: a number or (n,), in (0, 1); written as its logit.
         normals: (n, 3) or None for zeros.
-        labels: (n,) or None for no property `label`; as of `save_points_ply`.
-        classes: their names.
+        labels, classes: see `write_ply`.
     """
     means, covs, colors = (np.asarray(value, np.float64) for value in (means, covs, colors))
     normals = np.zeros_like(means) if normals is None else np.asarray(normals, np.float64)
@@ -47,56 +46,48 @@ def save_gaussians_ply(
     names = ["x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), "opacity"]
     names += [*(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4))]
     rows = np.concatenate([flat[keep], scales, quaternions], 1).astype(np.float32)
-    vertices = structured(rows, names)
-    if labels is not None:
-        vertices = _with_labels(vertices, np.asarray(labels)[keep])
-    write_ply(path, vertices, comments=_class_lines(classes))
+    write_ply(path, structured(rows, names), None, None if labels is None else np.asarray(labels)[keep], classes)
     return len(rows)
 
 
 def save_points_ply(
     path: str | os.PathLike, points: Any, normals: Any, colors: Any, labels: Any = None, classes: Sequence[str] = ()
 ) -> int:
-    """Write a cloud: points (n, 3) in metres, normals (n, 3), colours (n, 3) RGB in [0, 1]. Returns how many rows.
-
-    Labels (n,) become the property `label`, -1 = none; comments of the header say which class each number is.
-    """
+    """Write a cloud: points (n, 3) in metres, normals (n, 3), colours (n, 3) RGB in [0, 1]. Returns how many rows."""
     rows = np.concatenate([np.asarray(points), np.asarray(normals)], 1).astype(np.float32)
     keep = np.isfinite(rows).all(1)
     vertices = with_colors(structured(rows[keep], ["x", "y", "z", "nx", "ny", "nz"]), np.asarray(colors)[keep])
-    if labels is not None:
-        vertices = _with_labels(vertices, np.asarray(labels)[keep])
-    write_ply(path, vertices, comments=_class_lines(classes))
-    return int(keep.sum())
-
-
-def _with_labels(vertices: np.ndarray, labels: np.ndarray) -> np.ndarray:
-    return recfunctions.append_fields(vertices, "label", labels.astype("i4"), usemask=False)
-
-
-def _class_lines(classes: Sequence[str]) -> list[str]:
-    return [f"label {number} {name}".encode("ascii", "replace").decode() for number, name in enumerate(classes)]
+    write_ply(path, vertices, None, None if labels is None else np.asarray(labels)[keep], classes)
+    return len(vertices)
 
 
 def write_ply(
-    path: str | os.PathLike, vertices: np.ndarray, faces: np.ndarray | None = None, comments: Sequence[str] = ()
+    path: str | os.PathLike,
+    vertices: np.ndarray,
+    faces: np.ndarray | None = None,
+    labels: np.ndarray | None = None,
+    classes: Sequence[str] = (),
 ) -> None:
     """Write a binary little-endian PLY.
 
     Args:
         vertices: structured array (n,); its field names become the properties, in order.
         faces: triangles as vertex indices, int (t, 3); None for a cloud.
-        comments: lines of the header, ASCII.
+        labels: (n,) or None for no property `label`; -1 = none.
+        classes: names of the labels, which the header's comments say.
     """
+    if labels is not None:
+        vertices = recfunctions.append_fields(vertices, "label", labels.astype("i4"), usemask=False)
     vertices = vertices.astype(vertices.dtype.newbyteorder("<"))
-    header = ["ply", "format binary_little_endian 1.0", *(f"comment {line}" for line in comments)]
+    header = ["ply", "format binary_little_endian 1.0"]
+    header += [f"comment label {number} {name}" for number, name in enumerate(classes)]
     header.append(f"element vertex {len(vertices)}")
     for name in vertices.dtype.names:
         header.append(f"property {_PLY_TYPES[vertices.dtype[name].str[1:]]} {name}")
     if faces is not None:
         header += [f"element face {len(faces)}", "property list uchar int vertex_indices"]
     with atomic_write(path) as handle:
-        handle.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii"))
+        handle.write(("\n".join([*header, "end_header"]) + "\n").encode("ascii", "replace"))
         handle.write(vertices.tobytes())
         if faces is not None:
             rows = np.empty(len(faces), [("count", "u1"), ("indices", "<i4", (3,))])
@@ -111,9 +102,5 @@ def structured(rows: np.ndarray, names: list[str]) -> np.ndarray:
 
 def with_colors(rows: np.ndarray, colors: np.ndarray) -> np.ndarray:
     """A structured array with the fields red, green and blue, 8 bits each, of RGB (n, 3) in [0, 1]."""
-    out = np.empty(len(rows), rows.dtype.descr + [(name, "u1") for name in ("red", "green", "blue")])
-    for name in rows.dtype.names:
-        out[name] = rows[name]
     channels = np.rint(255.0 * np.nan_to_num(colors).clip(0.0, 1.0)).astype(np.uint8)
-    out["red"], out["green"], out["blue"] = channels.T
-    return out
+    return recfunctions.append_fields(rows, ("red", "green", "blue"), [*channels.T], usemask=False)

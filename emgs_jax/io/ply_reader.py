@@ -33,16 +33,16 @@ def read_vertices(path: str | os.PathLike) -> dict[str, np.ndarray]:
     """
     content = Path(path).read_bytes()
     order, elements, start = _header(content, path)
-    before = [element.name for element in elements].index("vertex") if _has_vertices(elements) else None
-    if before is None:
+    vertex = next((element for element in elements if element.name == "vertex"), None)
+    if vertex is None or not {"x", "y", "z"} <= vertex.properties.keys():
         raise ValueError(f"{path} has no element vertex with the properties x, y and z: it holds no points; {REMEDY}")
-    vertex, body = elements[before], memoryview(content)[start:]
-    if None in [kind for element in elements[: before + 1] for kind in element.properties.values()]:
+    body, before = memoryview(content)[start:], elements[: elements.index(vertex)]
+    if None in [kind for element in (*before, vertex) for kind in element.properties.values()]:
         raise ValueError(f"{path} has a list among or before its vertices, which is not read: {REMEDY} without it")
     if order == "":
-        return _read_text(bytes(body), elements, before, path)
+        return _read_text(bytes(body), elements, vertex, path)
     _check_size(len(body), elements, path)
-    skipped = sum(element.count * _row_type(element, order).itemsize for element in elements[:before])
+    skipped = sum(element.count * _row_type(element, order).itemsize for element in before)
     rows = np.frombuffer(body, _row_type(vertex, order), vertex.count, skipped)
     return {name: rows[name].astype(rows.dtype[name].newbyteorder("=")) for name in vertex.properties}
 
@@ -114,10 +114,6 @@ def _is_type(words: list[str]) -> bool:
     return {*words[1:]} <= _TYPES.keys() if is_list else len(words) == 1 and words[0] in _TYPES
 
 
-def _has_vertices(elements: list[Element]) -> bool:
-    return any(element.name == "vertex" and {"x", "y", "z"} <= element.properties.keys() for element in elements)
-
-
 def _row_type(element: Element, order: str) -> np.dtype:
     """One row of an element without lists."""
     return np.dtype([(name, order + str(kind)) for name, kind in element.properties.items()])
@@ -136,26 +132,20 @@ def _check_size(num_bytes: int, elements: list[Element], path: object) -> None:
         )
 
 
-def _read_text(body: bytes, elements: list[Element], before: int, path: object) -> dict[str, np.ndarray]:
+def _read_text(body: bytes, elements: list[Element], vertex: Element, path: object) -> dict[str, np.ndarray]:
     """The vertices of a file in ascii: one line for each row of each element."""
     lines = [line for line in body.decode("ascii", "replace").splitlines() if line.strip()]
     expected = sum(element.count for element in elements)
     if len(lines) != expected:
         raise ValueError(f"{path} has {len(lines)} rows after its header, which announces {expected}: {REMEDY}")
-    vertex, first = elements[before], sum(element.count for element in elements[:before])
-    columns: list[list[float]] = []
-    for row in range(vertex.count):
-        words = lines[first + row].split()
+    first = sum(element.count for element in elements[: elements.index(vertex)])
+    table = np.empty((vertex.count, len(vertex.properties)))
+    for row, line in enumerate(lines[first : first + vertex.count]):
         try:
-            columns.append([float(word) for word in words])
-        except ValueError:
-            columns.append([math.nan] * (1 + len(vertex.properties)))
-        if len(columns[-1]) != len(vertex.properties):
-            raise ValueError(
-                f"{path}, vertex {row} (from 0): expected {len(vertex.properties)} numbers, got "
-                f"{lines[first + row][:80]!r}: {REMEDY}"
-            )
-    table = np.array(columns, np.float64).reshape(vertex.count, len(vertex.properties))
+            table[row] = [float(word) for word, _ in zip(line.split(), vertex.properties, strict=True)]
+        except ValueError as error:
+            what = f"expected {len(vertex.properties)} numbers, got {line[:80]!r}"
+            raise ValueError(f"{path}, vertex {row} (from 0): {what}: {REMEDY}") from error
     read = {}
     for name, column in zip(vertex.properties, table.T, strict=True):
         with np.errstate(invalid="ignore"):  # of what is no number

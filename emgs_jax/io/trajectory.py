@@ -55,14 +55,13 @@ def load_trajectory_tum(path: str | os.PathLike, may_lack: bool = False) -> tupl
         if may_lack and len(values) == 8 and np.isnan(values[1:]).all():
             rows.append(values)
             continue
-        if fields and (len(values) != 8 or not np.isfinite(values).all()):
+        if not fields:
+            continue
+        if len(values) != 8 or not np.isfinite(values).all():
             raise ValueError(f"{path}:{number}: expected `timestamp tx ty tz qx qy qz qw`, got {line[:80]!r}")
-        if fields and (np.abs(values[1:]).max() > MAX_VALUE or abs(np.linalg.norm(values[4:]) - 1) > MAX_NORM_ERROR):
-            raise ValueError(
-                f"{path}:{number}: expected a pose, with a quaternion of length 1 and a position within {MAX_VALUE:g}, "
-                f"got {line[:80]!r}"
-            )
-        if fields:
-            rows.append(values)
+        if np.abs(values[1:]).max() > MAX_VALUE or abs(np.linalg.norm(values[4:]) - 1) > MAX_NORM_ERROR:
+            what = f"a pose, with a quaternion of length 1 and a position within {MAX_VALUE:g}"
+            raise ValueError(f"{path}:{number}: expected {what}, got {line[:80]!r}")
+        rows.append(values)
     rows = np.array(rows, np.float64).reshape(-1, 8)
     return rows[:, 0], from_tum(rows[:, 1:])

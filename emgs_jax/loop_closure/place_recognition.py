@@ -50,12 +50,6 @@ class PlaceRecognitionConfig:
     num_neighbours: int = number(low=1, high=1000)
     quantile: float = number(low=0, high=1)
 
-    def __post_init__(self) -> None:
-        if not 0 <= self.quantile <= 1:
-            raise ValueError(f"quantile must be between 0 and 1, got {self.quantile}")
-        if self.num_neighbours < 1:
-            raise ValueError(f"num_neighbours must be 1 or more, got {self.num_neighbours}")
-
 
 @dataclass(frozen=True)
 class Keyframe:
@@ -91,14 +85,6 @@ class Database:
     words: Float32[np.ndarray, "k 128"] = field(default_factory=lambda: np.zeros((0, sift.DESCRIPTOR_SIZE), np.float32))
     vectors: Float32[np.ndarray, "n v"] = field(default_factory=lambda: np.zeros((0, 0), np.float32))
     num_trained: int = 0
-
-
-@dataclass(frozen=True)
-class Candidate:
-    """A keyframe, as row of the database, that may show the query's place, and its cosine with the query."""
-
-    row: int
-    score: float
 
 
 def make_keyframe(
@@ -180,16 +166,11 @@ def add_keyframe(database: Database, keyframe: Keyframe, config: PlaceRecognitio
 
 def train_database(keyframes: Sequence[Keyframe], config: PlaceRecognitionConfig) -> Database:
     """Make the database of keyframes, in their order, with words of all of them."""
-    words = train_vocabulary(np.concatenate([unit_descriptors(one) for one in keyframes]), config)
+    descriptors = np.concatenate([unit_descriptors(one) for one in keyframes])
+    sizes = config.num_words, config.max_training, config.num_iterations
+    words = train_words(descriptors, sizes, config.seed)
     vectors = np.stack([vlad(unit_descriptors(one), words) for one in keyframes])
     return Database(tuple(keyframes), words, vectors, len(keyframes) if len(words) else 0)
-
-
-def train_vocabulary(
-    descriptors: Float32[np.ndarray, "n 128"], config: PlaceRecognitionConfig
-) -> Float32[np.ndarray, "k 128"]:
-    """`train_words` with the settings of place recognition."""
-    return train_words(descriptors, (config.num_words, config.max_training, config.num_iterations), config.seed)
 
 
 def train_words(
@@ -228,8 +209,8 @@ def _unit(vectors: Float32[np.ndarray, "*b d"]) -> Float32[np.ndarray, "*b d"]:
     return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-6)
 
 
-def propose_candidates(database: Database, row: int, config: PlaceRecognitionConfig) -> list[Candidate]:
-    """Propose loop candidates: earlier keyframes at least as similar as the query's own last neighbours, best first.
+def propose_candidates(database: Database, row: int, config: PlaceRecognitionConfig) -> list[int]:
+    """Propose loop candidates (rows): earlier keyframes as similar as the last neighbours or more, best first.
 
     At least `min_gap` frames older, the best only within `suppressed_gap` frames, `num_candidates` at most; none for
     the first keyframe. The threshold is a quantile of the similarity to neighbours (LoopSplat, ViSTA-SLAM).
@@ -247,7 +228,7 @@ def propose_candidates(database: Database, row: int, config: PlaceRecognitionCon
 
 def most_similar(
     database: Database, query: Keyframe, rows: Sequence[int], count: int, config: PlaceRecognitionConfig
-) -> list[Candidate]:
+) -> list[int]:
     """Find the keyframes (rows) most similar to one without a known time, the best only within `suppressed_gap` frames.
 
     There is no threshold of the similarity: that of `propose_candidates` comes from the query's neighbours in time.
@@ -265,11 +246,11 @@ def _apart(
     is_allowed: Bool[np.ndarray, " n"],
     count: int,
     gap: int,
-) -> list[Candidate]:
+) -> list[int]:
     """The most similar of the allowed rows, `count` at most, each more than `gap` frames from the better ones."""
-    chosen: list[Candidate] = []
+    chosen: list[int] = []
     for row in np.argsort(-similarity, kind="stable"):
-        apart = [abs(frames[row] - frames[one.row]) > gap for one in chosen]
+        apart = [abs(frames[row] - frames[one]) > gap for one in chosen]
         if is_allowed[row] and all(apart) and len(chosen) < count:
-            chosen.append(Candidate(int(row), float(similarity[row])))
+            chosen.append(int(row))
     return chosen

@@ -92,7 +92,7 @@ def relocalize(
     if not candidates:
         return None, NO_CANDIDATE
     alone = replace(verification, min_neighbours=0)
-    results = [(one.row, *verify(query, keyframes[one.row], (), alone)) for one in candidates]
+    results = [(row, *verify(query, keyframes[row], (), alone)) for row in candidates]
     verified = sorted(((row, loop) for row, loop, _ in results if loop), key=lambda found: -found[1].num_inliers)
     if not verified:
         return None, max((info.refused_by for *_, info in results), key=list(Gate).index)

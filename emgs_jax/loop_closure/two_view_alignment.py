@@ -58,10 +58,10 @@ class AlignmentConfig:
 
     max_ratio: float = number(low=0, high=1)
     max_epipolar_error: float = number(low=0, high=1000)
-    min_matches: int = number(low=1)
+    min_matches: int = number(low=MIN_POSE)
     min_match_share: float = number(low=0, high=1)
     max_reprojection_error: float = number(low=0, high=1000)
-    min_pose_points: int = number(low=1)
+    min_pose_points: int = number(low=MIN_POSE)
     max_pose_gap: float = number(low=0, high=math.inf)
     max_pose_turn_deg: float = number(low=0, high=math.inf)
     min_hull: float = number(low=0, high=1)
@@ -70,13 +70,6 @@ class AlignmentConfig:
     max_depth_scatter: float = number(low=0, high=math.inf)
     scale_std: float = number(low=0, high=math.inf)
     refine: RefineConfig
-
-    def __post_init__(self) -> None:
-        if min(self.min_matches, self.min_pose_points) < MIN_POSE:
-            raise ValueError(
-                f"min_matches and min_pose_points must be {MIN_POSE} or more, which a pose needs; "
-                f"got {self.min_matches}, {self.min_pose_points}"
-            )
 
 
 class RefusedError(Exception):

@@ -88,7 +88,10 @@ def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
     Args:
         origin: (3,) of the first camera.
     """
-    return rescaled(state, np.exp(-float(state.estimate.log_scale)), origin) if state.estimate.log_scale else state
+    if not state.estimate.log_scale:
+        return state
+    factor = np.exp(-float(state.estimate.log_scale))
+    return _rescaled(state, *on_device((np.float32(factor), np.asarray(origin, np.float32))))
 
 
 def rescale_atlas(atlas: Atlas, first: np.ndarray) -> Atlas:
@@ -104,13 +107,10 @@ def rescale_atlas(atlas: Atlas, first: np.ndarray) -> Atlas:
     return with_state(replace(atlas, graph=graph), in_prior_unit(state, first[:3, 3]), atlas.config)
 
 
-def rescaled(state: SlamState, factor: float, origin: np.ndarray) -> SlamState:
-    """Multiply all lengths of a state by `factor`, about `origin`."""
-    return _rescaled(state, *on_device((np.float32(factor), np.asarray(origin, np.float32))))
-
-
 @stored
 def _rescaled(state: SlamState, factor: Float[Array, ""], center: Float[Array, "3"]) -> SlamState:
+    """Multiply all lengths of a state by `factor`, about a point."""
+
     def placed(points: jnp.ndarray) -> jnp.ndarray:
         return center + factor * (points - center)
 

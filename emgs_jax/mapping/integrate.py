@@ -16,7 +16,7 @@ from emgs_jax.back_end.loops import (
     remove_inconsistent,
     violated,
 )
-from emgs_jax.back_end.optimization import close_loops, merge_duplicates_of_state, nodes_of
+from emgs_jax.back_end.optimization import close_loops, merge_duplicates_of_state
 from emgs_jax.back_end.state import BackEnd, add_node
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.device.clock import Clock, Timer
@@ -129,9 +129,7 @@ def finish_back_end(atlas: Atlas, query: PriorQuery = lambda a, b: None) -> Atla
     if len(kept.accepted) < len(end.accepted) or kept.accepted or loops:
         atlas = optimize_and_deform(atlas, loops)
     end = atlas.graph
-    noise = [node.depth_noise for node in end.nodes if node.is_placed and node.depth_noise is not None]
-    if noise and (end.accepted or not end.has_one_unit):  # at the end only: what was made one Gaussian stays one
-        nodes = nodes_of(end, end.active)
-        state = merge_duplicates_of_state(atlas.state, nodes, float(np.median(noise)), atlas.config.existence)
+    if end.accepted or not end.has_one_unit:  # at the end only: what was made one Gaussian stays one
+        state = merge_duplicates_of_state(atlas.state, end, atlas.config.existence)
         atlas = with_state(atlas, state, atlas.config)
     return atlas

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.back_end.loops import consistent_loops, detect_loops_between
-from emgs_jax.back_end.optimization import close_loops
+from emgs_jax.back_end.optimization import close_loops, one_layer_of_state
 from emgs_jax.back_end.saved_map import LEFT_OUT
 from emgs_jax.back_end.state import BackEnd, Node, transform_nodes
 from emgs_jax.gaussian_map import transformed
@@ -50,6 +50,8 @@ def join(atlas: Atlas, other: Atlas) -> Atlas | str:
     graph, state = close_loops(graph, replace(both.state, map=map), loops)
     if graph.closures[-1].info.reason:
         return f"no poses fit the {len(loops)} loops between both: {graph.closures[-1].info.reason}"
+    is_other = [node.submap == number for node in both.graph.nodes]
+    state = one_layer_of_state(state, graph, is_other, config.existence)
     submaps = {one: submap for one, submap in both.submaps.items() if one != number}
     return with_state(replace(both, graph=graph, submaps=submaps), state, config)
 

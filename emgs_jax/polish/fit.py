@@ -1,7 +1,6 @@
 """The fit of splats, and of poses, to the frames: Adam, one frame a step, in an order that the seed says."""
 
 import hashlib
-import io
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
@@ -16,8 +15,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from emgs_jax.data.spool import Spool
-from emgs_jax.io.files import atomic_write
-from emgs_jax.io.npz import read_npz
+from emgs_jax.io.npz import load_headed, save_headed
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.ranges import number
@@ -258,24 +256,20 @@ def _signature(anchors: Anchors, colors: np.ndarray, config: PolishConfig) -> st
     return digest.hexdigest()
 
 
-def _write(path: Path, step: int, state, signature: str) -> None:
-    buffer = io.BytesIO()
+def _write(path: Path, step: int, state: State, signature: str) -> None:
     leaves = {f"leaf{number}": np.asarray(leaf) for number, leaf in enumerate(jax.tree.leaves(state))}
-    np.savez(buffer, step=step, signature=signature, **leaves)
-    with atomic_write(path) as handle:
-        handle.write(buffer.getvalue())
+    save_headed(path, {"signature": signature, "step": step}, leaves)
 
 
-def _read(path: Path, state, signature: str):
+def _read(path: Path, state: State, signature: str) -> tuple[int, State]:
     """Return the step to go on from and the state there; the beginning where there is none, or one of another fit."""
-    if not path.is_file():
-        return 0, state
     leaves, tree = jax.tree.flatten(state)
-    found = read_npz(path.read_bytes())
-    if str(found.get("signature")) != signature:
+    try:
+        header, found = load_headed(path, {"signature": signature})
+    except (OSError, ValueError):
         return 0, state
     leaves = [jnp.asarray(found[f"leaf{number}"], leaf.dtype) for number, leaf in enumerate(leaves)]
-    return int(found["step"]), jax.tree.unflatten(tree, leaves)
+    return int(header["step"]), jax.tree.unflatten(tree, leaves)
 
 
 def without_transparent(anchors: Anchors, fitted: Appearance, min_opacity: float) -> tuple[Anchors, Appearance]:

@@ -40,7 +40,10 @@ class _Motions(eqx.Module):
 
 
 def _motions(before: Nodes, after: Nodes) -> _Motions:
-    """Of each node, and whether it moved at all."""
+    """Of each node, and whether it moved at all; one that is not in use stays, whatever it holds."""
+    count = before.valid.shape[0]
+    still = Nodes(jaxlie.SE3.identity((count,)), jnp.zeros(count), before.valid)
+    before, after = (where_rows(before.valid, nodes, still) for nodes in (before, after))
     turn = after.T_world.rotation() @ before.T_world.rotation().inverse()
     is_same = jnp.all(before.T_world.wxyz_xyz == after.T_world.wxyz_xyz, axis=-1)
     has_moved = before.valid & ~(is_same & (before.log_scale == after.log_scale))

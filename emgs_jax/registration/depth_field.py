@@ -12,6 +12,7 @@ NUM_NODES = 5  # along each side of the image
 NUM_ROUNDS = 3  # of weights and field in turn
 NUM_INDEPENDENT = 160  # errors in an image beside the field: neighbouring points err alike
 LEAST_SIDE = 1e-6  # of the image, in focal lengths
+LEAST_NOISE = 2.0**-22  # of a logarithm of depth: its rounding
 
 
 class DepthField(eqx.Module):
@@ -87,7 +88,7 @@ def depth_field(
     Args:
         points: camera frame.
         errors: ρ, log of each point's depth over that of the map along its ray.
-        noise: σ of each error, that of the field included: a field has to be clear of it; above 0.
+        noise: σ of each error, that of the field included: a field has to be clear of it.
         valid: which errors are known.
         length: over which the field is alike, as a fraction of the image's side.
     """
@@ -98,7 +99,7 @@ def depth_field(
     has_any = jnp.any(is_before)
     low, high = jnp.where(has_any, low, 0.0), jnp.where(has_any, high, 0.0)
 
-    errors, noise = jnp.where(is_before, errors, 0.0), jnp.where(is_before, noise, 1.0)
+    errors, noise = jnp.where(is_before, errors, 0.0), jnp.where(is_before, jnp.maximum(noise, LEAST_NOISE), 1.0)
     basis = node_weights(points, low, high).reshape(-1, NUM_NODES**2)
     place = jnp.stack(jnp.meshgrid(*[jnp.linspace(0.0, 1.0, NUM_NODES)] * 2, indexing="ij"), axis=-1).reshape(-1, 2)
     apart = jnp.sum((place - place[:, None]) ** 2, axis=-1)

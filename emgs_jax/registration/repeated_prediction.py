@@ -64,8 +64,11 @@ def repeat_error(
 
     Without a pair nothing is known, and `max_pair_distance` (fraction of the depth) stands in.
     """
-    paired, mean_depth = now.valid & before.valid, scale * median(now.points[:, 2], now.valid)
-    apart = jnp.linalg.norm(transform(T_world_previous, now, scale).points - before.points, axis=-1)
+    paired, depth = now.valid & before.valid, now.points[:, 2]
+    mean_depth = scale * median(depth, now.valid & (depth > 0))
+    apart = transform(T_world_previous, now, scale).points - before.points
+    differs = jnp.any(apart != 0, axis=-1)  # a length has no gradient where it is 0
+    apart = jnp.where(differs, jnp.linalg.norm(jnp.where(differs[:, None], apart, 1.0), axis=-1), 0.0)
     apart = jnp.where(jnp.any(paired), robust_std(apart, paired), MAD_TO_STD * max_pair_distance * mean_depth)
     return apart, mean_depth
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.ops.linalg import SMALLEST_LENGTH
+from emgs_jax.ops.linalg import ROUNDED, SMALLEST_LENGTH
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.ranks import kth_smallest
 
@@ -42,13 +42,26 @@ def fit_rigid(
     share = weights / jnp.where(total > 0, total, 1.0)
     source_mean, target_mean = share @ source, share @ target
     a, b = source - source_mean, target - target_mean
-    u, s, vt = jnp.linalg.svd((share[:, None] * b).T @ a)
+    moments = (share[:, None] * b).T @ a
+    u, s, vt = jnp.linalg.svd(jax.lax.stop_gradient(moments))
     handed = jnp.array([1.0, 1.0, 1.0]).at[2].set(jnp.sign(jnp.linalg.det(u @ vt)))
-    rotation = jnp.where(total > 0, (u * handed) @ vt, jnp.eye(3))
+    # Slopes of the rotation itself: those of its two factors are infinite where singular values are equal.
+    signed, inner = s * handed, handed[:, None] * (u.T @ moments @ vt.T)
+    both = signed[:, None] + signed
+    is_known = both > ROUNDED * s[0]
+    turn = jnp.where(is_known, (inner - inner.T) / jnp.where(is_known, both, 1.0), 0.0)
+    rotation = (u * handed) @ ((jnp.eye(3) + _slope_only(turn)) @ vt)
+    rotation = jnp.where(total > 0, rotation, jnp.eye(3))
     spread = share @ jnp.sum(a * a, axis=-1)
-    scale = jnp.where(spread > 0, (s @ handed) / jnp.where(spread > 0, spread, 1.0), 1.0)
+    size = s @ handed + _slope_only(jnp.trace(inner))
+    scale = jnp.where(spread > 0, size / jnp.where(spread > 0, spread, 1.0), 1.0)
     T = jaxlie.SE3.from_rotation_and_translation(jaxlie.SO3.from_matrix(rotation), target_mean - rotation @ source_mean)
     return T, scale
+
+
+def _slope_only(values: Float[Array, "*b"]) -> Float[Array, "*b"]:
+    """0, with the derivatives of `values`."""
+    return values - jax.lax.stop_gradient(values)
 
 
 @full_precision

@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from g2o_reader import load_graph_g2o
 from omegaconf import OmegaConf
 from scene import assert_same, random_gaussians, random_observation
 
 from emgs_jax import back_end, load_config
 from emgs_jax.back_end.factors import FrameData, map_factor, sequential_factor, stack_factors
-from emgs_jax.back_end.g2o import save_graph_g2o
 from emgs_jax.back_end.loops import (
     consistent_loops,
     is_closure_due,
@@ -24,8 +22,8 @@ from emgs_jax.back_end.loops import (
     remove_inconsistent,
     violated,
 )
-from emgs_jax.back_end.optimization import close_loops, merge_duplicates_of_state, nodes_of
-from emgs_jax.back_end.state import BackEnd, add_node
+from emgs_jax.back_end.optimization import close_loops, depth_noise_of, merge_duplicates_of_state, nodes_of
+from emgs_jax.back_end.state import BackEnd, Node, add_node
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.geometry import scale_pose
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe
@@ -37,7 +35,7 @@ from emgs_jax.mapping.event import Event
 from emgs_jax.mapping.integrate import finish_back_end, update_graph
 from emgs_jax.mapping.window_input import WindowInput
 from emgs_jax.pose_graph.deform import DeformConfig
-from emgs_jax.pose_graph.factors import Nodes, PoseGraph, residuals
+from emgs_jax.pose_graph.factors import PoseGraph, residuals
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.report import back_end as report
 from emgs_jax.report.back_end import counts, found_loops, loop_list, metric_graph, revisit_note
@@ -87,7 +85,7 @@ def walked(graph, poses: np.ndarray, scale: float = 1.0) -> BackEnd:
 
 
 def atlas_of(end: BackEnd, state: SlamState) -> Atlas:
-    return Atlas(None, None, end, {0: Submap(state)})
+    return Atlas(None, load_config().slam, end, {0: Submap(state)})
 
 
 def changed(end: BackEnd, **columns) -> BackEnd:
@@ -307,19 +305,6 @@ def test_without_a_loop_nothing_moves_however_the_predictions_differ(graph):
     assert_same(close_loops(end, state)[1].map, state.map)
 
 
-def test_other_solvers_read_the_graph_in_the_scale_of_the_map(graph, tmp_path):
-    poses = ring()
-    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
-    for index, pose in enumerate(poses):
-        end = add_node(end, look(poses, index), pose, 1.1, None)
-    save_graph_g2o(tmp_path / "graph.g2o", metric_graph(end))
-    read = load_graph_g2o(tmp_path / "graph.g2o")
-    assert int(read.nodes.valid.sum()) == COUNT and len(read.factors.a) == len(end.factors)
-    np.testing.assert_allclose(
-        read.factors.Z_a_b.translation()[0], 1.1 * end.factors[0].Z_a_b[:3, 3], rtol=1e-5, atol=1e-6
-    )
-
-
 def test_a_graph_for_other_solvers_costs_what_ours_does_and_has_the_nodes_of_the_map_only(graph):
     poses = ring()
     end = walked(graph, poses, scale=2.0)
@@ -486,13 +471,13 @@ def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_
     end = changed(end, depth_noise=noise, is_placed=[one < 9.0 for one in noise])  # the others fit nothing
     asked, config = [], SimpleNamespace(existence="gates", submap=SimpleNamespace(map_capacity=COUNT))
 
-    def settled(state, nodes, noise, gates):
-        asked.append((noise, gates, nodes.T_world.as_matrix()[:COUNT]))
+    def settled(state, end, gates):
+        asked.append((float(depth_noise_of(end)), gates, end.poses))
         return replace(state, time=jnp.asarray(-1))
 
     monkeypatch.setattr(integrate, "merge_duplicates_of_state", settled)
     atlas = finish_back_end(replace(atlas_of(end, state_of(drifted)), config=config))
-    assert [one[:2] for one in asked] == ([(0.01, "gates")] if has_loop else [])
+    assert [one[:2] for one in asked] == ([(np.float32(0.01), "gates")] if has_loop else [])
     assert (atlas.state.time == -1) == has_loop
     for *_, poses in asked:
         np.testing.assert_allclose(poses, atlas.graph.poses, atol=1e-5)
@@ -510,7 +495,8 @@ def test_a_gaussian_is_seen_from_the_node_of_its_birth(graph):
     map = eqx.tree_at(lambda m: m.birth, map, jnp.array([0, 0, 1, 1], jnp.int32))
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, :3, 3] = 8.0, 0.0, 3.0
-    nodes = Nodes(jaxlie.SE3.from_matrix(jnp.asarray(poses, jnp.float32)), jnp.zeros(2), jnp.ones(2, bool))
+    nodes = tuple(Node(pose, pose, 0.0, row, depth_noise=0.02) for row, pose in enumerate(poses))
+    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01, nodes)
     state = replace(state_of(ring()), map=map)
-    after = merge_duplicates_of_state(state, nodes, 0.02, load_config().slam.existence)
+    after = merge_duplicates_of_state(state, end, load_config().slam.existence)
     np.testing.assert_array_equal(after.map.gaussians.valid, [True, False, True, True])

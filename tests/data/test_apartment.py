@@ -15,7 +15,7 @@ SEEDS_AND_WALKS = [*((0, walk) for walk in WALKS), (1, "two_laps"), (1, "twin_ro
 
 @cache
 def apartment(walk: str = "two_laps", seed: int = 0) -> Apartment:
-    return Apartment(seed, walk, size=(80, 60))
+    return Apartment(seed, walk=walk, size=(80, 60))
 
 
 @cache
@@ -24,13 +24,8 @@ def poses(walk: str, seed: int = 0) -> np.ndarray:
     return np.array([dataset.pose(index) for index in range(len(dataset))])
 
 
-@cache
 def surfaces(seed: int) -> o3d.t.geometry.RaycastingScene:
-    scene = o3d.t.geometry.RaycastingScene()
-    for _, mesh in apartment(seed=seed).parts:
-        vertices, faces = np.array(mesh.vertices, np.float32), np.array(mesh.faces, np.uint32)
-        scene.add_triangles(o3d.core.Tensor(vertices), o3d.core.Tensor(faces))
-    return scene
+    return apartment(seed=seed)._scene
 
 
 def rooms(plan: Plan) -> tuple[Area, ...]:
@@ -204,7 +199,8 @@ def test_fewer_frames_and_a_stride_go_the_same_way():
     [
         ({"walk": "round"}, "walk must be one of two_laps, figure_of_eight, out_and_back, twin_rooms, corridor"),
         ({"seed": -1}, "dataset.seed must be 0 or more .* got -1"),
-        ({"num_frames": 0}, "dataset.num_frames 1 or more, or null"),
+        ({"num_frames": 0}, "dataset.num_frames 1 or more, got 0, 0, 0"),
+        ({"movers": -1}, "must be 0 or more .dataset.movers likewise. .* got 0, -1"),
         ({"stride": 0}, "dataset.stride must be at least 1"),
     ],
 )

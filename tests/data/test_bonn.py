@@ -44,10 +44,3 @@ def test_images_are_straightened_with_the_benchmarks_calibration_whatever_the_se
     straight, *_ = undistortion(Calibration(*CALIBRATION), (640, 480))
     np.testing.assert_allclose(dataset.intrinsics[:2], np.array(straight[:2]) / 2)
     assert dataset.calibration["distortion"] == [*CALIBRATION[1]]
-
-
-def test_an_image_without_a_pose_near_in_time_has_none(tum_root):
-    path = tum_root / "rgbd_dataset_freiburg3_plane" / "groundtruth.txt"
-    path.write_text("100.0 0 0 0 0 0 0 1\n101.0 nan 0 0 0 0 0 1\n")
-    dataset = load(tum_root)
-    assert [dataset.pose(row) is None for row in range(3)] == [False, True, True]

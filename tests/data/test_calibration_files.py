@@ -64,6 +64,11 @@ FILES = {
     "camera_info.yaml": (ROS, LENS),
     "orb.yaml": (ORB, LENS),
     "orb_rgbd.yaml": (ORB + "ThDepth: 40.0\nDepthMapFactor: 5000.0\n", LENS),  # of ORB-SLAM2
+    "openvslam.yaml": (
+        ORB.replace("Camera.width", "Camera.cols").replace("Camera.height", "Camera.rows")
+        + "Camera.setup: monocular\nCamera.model: perspective\nFeature.max_num_keypoints: 2000\n",
+        LENS,
+    ),
     "intrinsics.yaml": (MAST3R, LENS),
     "straight/intrinsics.yaml": (f"width: 640\nheight: 480\ncalibration: {[*K]}\n", ()),
     "vipe.json": (json.dumps(PLAIN), ()),
@@ -131,21 +136,3 @@ def test_what_opencv_writes_is_read(shape, tmp_path):
     file.release()
     camera = read_calibration(path)
     assert (camera.intrinsics, camera.size, camera.distortion) == (K, (640, 480), LENS[: min(lens.size, 5)])
-
-
-def test_colmaps_models_with_one_focal_length(tmp_path):
-    for line, lens in (
-        (f"SIMPLE_PINHOLE 640 480 500 {CORNER}", ()),
-        (f"SIMPLE_RADIAL 640 480 500 {CORNER} .1", (0.1, 0, 0, 0)),
-        (f"RADIAL 640 480 500 {CORNER} .1 -.2", (0.1, -0.2, 0, 0)),
-    ):
-        camera = read_calibration(write(tmp_path, "cameras.txt", f"1 {line}\n2 {line}\n"))  # one camera, listed twice
-        assert camera.intrinsics == (500, 500, *K[2:]) and camera.distortion == lens
-
-
-def test_openvslams_yaml_is_read_as_orb_slams_with_its_own_names_of_size_and_model(tmp_path):
-    plain, other = tmp_path / "orb.yaml", tmp_path / "openvslam.yaml"
-    plain.write_text(ORB)
-    text = ORB.replace("Camera.width", "Camera.cols").replace("Camera.height", "Camera.rows")
-    other.write_text(text + "Camera.setup: monocular\nCamera.model: perspective\nFeature.max_num_keypoints: 2000\n")
-    assert read_calibration(other) == read_calibration(plain)

@@ -5,6 +5,7 @@ import sys
 import cv2
 import numpy as np
 import pytest
+from written_scene import center_of_dot, dots
 
 from emgs_jax.data.camera_models import MODELS, Calibration, from_colmap, project, to_pycolmap
 from emgs_jax.data.colmap_model import load_cameras, load_colmap
@@ -50,19 +51,6 @@ def from_corner(model: str, points) -> np.ndarray:
     return oracle(model).img_from_cam(np.column_stack([points, np.ones(len(points))])) - 0.5
 
 
-def dots(pixels) -> np.ndarray:
-    """Soft white dots, RGB."""
-    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
-    spots = sum(np.exp(-((u - x) ** 2 + (v - y) ** 2) / 4) for x, y in pixels)
-    return np.repeat(np.rint(255 * np.minimum(spots, 1))[..., None], 3, axis=-1).astype(np.uint8)
-
-
-def center_of_dot(image, near) -> np.ndarray:
-    u, v = np.meshgrid(np.arange(SIZE[0]), np.arange(SIZE[1]))
-    weight = image[..., 0] * ((u - near[0]) ** 2 + (v - near[1]) ** 2 < 64.0)
-    return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
-
-
 def test_models_are_colmaps_in_their_order():
     known = {name: int(number) for name, number in pycolmap.CameraModelId.__members__.items() if name != "INVALID"}
     assert [*MODELS] == sorted(known, key=known.get)[: len(MODELS)]
@@ -100,7 +88,7 @@ def test_text_binary_and_numbers_are_one_camera_whose_points_are_where_colmap_se
 
 @pytest.mark.parametrize("model", LENSES)
 def test_a_straight_image_shows_a_point_where_its_pinhole_camera_sees_it(model, tmp_path):
-    cv2.imwrite(str(tmp_path / "1.png"), dots(from_corner(model, POINTS)))
+    cv2.imwrite(str(tmp_path / "1.png"), dots(from_corner(model, POINTS), SIZE))
     camera = from_colmap(model, params_of(model), SIZE, "here")
     (tmp_path / "cameras.txt").write_text(f"1 {model} 160 120 {' '.join(map(str, params_of(model)))}\n")
     dataset = Images(str(tmp_path), size=SIZE, intrinsics=str(tmp_path / "cameras.txt"))

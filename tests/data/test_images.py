@@ -51,11 +51,7 @@ def test_names_without_ascending_numbers_get_their_position_as_time(images_root)
     np.testing.assert_allclose(load(images_root, size=(80, 30)).intrinsics, (64, 32, 39.5, 14.5))  # another aspect
 
 
-def test_what_is_no_sequence_says_what_to_give(images_root, tmp_path):
-    for path in images_root.iterdir():
-        path.unlink()
-    with pytest.raises(ValueError, match="has no images"):
-        load(images_root)
+def test_a_camera_that_does_not_fit_names_the_video(tmp_path):
     path = tmp_path / "clip.mp4"
     write_video(path)  # a damaged header gave a video of 32x4, and the message named no file
     with pytest.raises(ValueError, match=r"principal point outside of the 160x120 images of .*clip\.mp4"):
@@ -229,13 +225,12 @@ def test_a_stream_without_times_has_those_of_its_nominal_rate():
     assert _times(StreamWithoutTimes(), None) == [0.0, 1 / 25, 2 / 25]
 
 
-@pytest.mark.parametrize(("share", "words"), [(0.66, "not whole, the recording or the copy was cut off"), (0, "empty")])
-def test_a_video_that_is_not_whole_is_to_be_copied_again_and_not_converted(share, words, tmp_path):
+def test_a_video_that_is_not_whole_is_to_be_copied_again_and_not_converted(tmp_path):
     path = tmp_path / "clip.mp4"
     write_video(path)
     whole = path.read_bytes()
-    path.write_bytes(whole[: int(share * len(whole))])
-    with pytest.raises(ValueError, match=f"clip.mp4 is {words}: copy it again"):
+    path.write_bytes(whole[: int(0.66 * len(whole))])
+    with pytest.raises(ValueError, match="clip.mp4 is not whole, the recording or the copy was cut off: copy it again"):
         load(path)
 
 

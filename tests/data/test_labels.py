@@ -6,7 +6,7 @@ import pytest
 from written_scene import scene_pose
 
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.labels import LabelFolder, as_unknown
+from emgs_jax.data.labels import LabelFolder
 from emgs_jax.data.tum import Tum
 
 SEQUENCE = "rgbd_dataset_freiburg3_plane"
@@ -29,6 +29,8 @@ def test_ids_become_positions_among_the_names_and_names_alone_count_from_zero(fo
     labels = labels_of(folder)
     assert labels.names == ("sofa", "wall plug", "wall")
     np.testing.assert_array_equal(labels.read("rgb/0.5.jpg", (3, 2)), [[0, 1, -1], [2, 2, 0]])
+    with pytest.raises(BadFrameError, match=r"no name in .* for id 0"):
+        labels_of(folder, unknown=()).read("0.5.jpg")
     # Ids that mean no class mean none also where they have a name.
     np.testing.assert_array_equal(labels_of(folder, unknown=(0, 7)).read("0.5.jpg"), [[-1, 1, -1], [2, 2, -1]])
     (folder / "classes.txt").write_text("wall\n3d printer\n\nold chair\n")
@@ -36,17 +38,6 @@ def test_ids_become_positions_among_the_names_and_names_alone_count_from_zero(fo
     labels = labels_of(folder, unknown=())
     assert labels.names == ("wall", "3d printer", "old chair")
     np.testing.assert_array_equal(labels.read("0.5.jpg"), [[2, 0, 1]])
-
-
-def test_ids_that_mean_no_class_are_the_users_to_name_and_what_is_not_there_is_named(folder):
-    with pytest.raises(BadFrameError, match=r"no name in .* for id 0"):
-        labels_of(folder, unknown=()).read("0.5.jpg")
-    assert as_unknown(None, "dataset.unknown") is None
-    for bad in ("0", 7, [-1], [1.5]):
-        with pytest.raises(ValueError, match=r"dataset\.unknown must be a list of ids"):
-            as_unknown(bad, "dataset.unknown")
-    with pytest.raises(ValueError, match=r"class file .*names\.txt does not exist"):
-        LabelFolder(folder / "semantic", folder / "names.txt")
 
 
 @pytest.fixture

@@ -36,14 +36,6 @@ DAMAGED = [
     ("replica", "office9/results/frame000001.jpg"),
     ("images", "img10.JPG"),
 ]
-BAD_VALUES = [
-    ("start", 3),
-    ("stop", 99),
-    ("stride", 0),
-    ("size", [320]),
-    ("size", [0, 1]),
-    ("intrinsics", [1, 1, 9999, 1]),
-]
 
 
 def load(name, root, **options):
@@ -62,20 +54,10 @@ def test_yaml_keys_and_values_are_the_constructors_parameters_and_defaults(path)
 
 
 @pytest.mark.parametrize("name", ON_DISK)
-def test_what_is_missing_or_a_bad_value_names_the_path_or_key_and_the_fingerprint_follows_the_options(name, request):
+def test_the_fingerprint_follows_the_options(name, request):
     root = request.getfixturevalue(f"{name}_root")
-    with pytest.raises(ValueError, match="dataset.root is not set: give dataset.root=FOLDER with the layout root"):
-        ON_DISK[name][0]()
-    with pytest.raises(FileNotFoundError, match="dataset.root=.*gone does not exist; expected the layout root"):
-        load(name, root / "gone")
-    with pytest.raises(FileNotFoundError, match="nowhere does not exist; expected the layout root"):
-        load(name, root, sequence="nowhere")
-    for key, value in BAD_VALUES:
-        with pytest.raises(ValueError, match=f"dataset.{key} "):
-            load(name, root, **{key: value})
-    assert load(name, root).fingerprint() == load(name, root).fingerprint()
-    assert load(name, root).fingerprint() != load(name, root, stride=2).fingerprint()
-    assert load(name, root).fingerprint() != load(name, root, size=(64, 48)).fingerprint()
+    found = [load(name, root, **options).fingerprint() for options in ({}, {"stride": 2}, {"size": (64, 48)})]
+    assert len({*found}) == 3 and load(name, root).fingerprint() == found[0]
 
 
 @pytest.mark.parametrize("name, file", DAMAGED)

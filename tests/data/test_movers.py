@@ -73,9 +73,3 @@ def test_a_person_walks_a_chair_is_moved_once_and_a_door_opens():
     tip = door.poses @ [1.0, 0, 0, 1]
     np.testing.assert_allclose(tip[0, :2], [6, 0.5], atol=1e-12)
     assert np.linalg.norm(tip[0] - tip[-1]) == pytest.approx(2 * np.sin(np.radians(50)))
-
-
-@pytest.mark.parametrize("make", [Synthetic, Apartment])
-def test_fewer_than_no_movers_are_refused(make):
-    with pytest.raises(ValueError, match="must be 0 or more .dataset.movers likewise. .* got 0, -1"):
-        make(movers=-1)

@@ -147,15 +147,6 @@ def test_binary_and_text_of_pycolmap_are_read_alike(second, tmp_path):
         np.testing.assert_allclose(text.pose(row)[:3, 3], image.projection_center(), atol=1e-9)
 
 
-def test_two_cameras_that_are_the_same_are_one(tmp_path):
-    model = write_colmap(tmp_path)
-    cameras = model / "cameras.txt"
-    (model / "images.txt").write_text((model / "images.txt").read_text().replace(" 7 img33", " 8 img33"))
-    line = f"8 PINHOLE 160 120 {CAMERAS['PINHOLE'][0]}\n"
-    cameras.write_text(cameras.read_text() + line)
-    assert len(Colmap(str(tmp_path))) == 3
-
-
 def test_a_pose_that_is_not_finite_is_none(tmp_path):
     write_nerfstudio(tmp_path)
     path = tmp_path / "transforms.json"

@@ -2,16 +2,13 @@
 
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from written_scene import plane_depth, scene_pose
 
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.timestamps import nearest_rows
-from emgs_jax.data.tum import CALIBRATIONS, Tum, read_list
-from emgs_jax.data.undistortion import undistortion
+from emgs_jax.data.tum import Tum, read_list
 
 SEQUENCE = "rgbd_dataset_freiburg3_plane"
 LISTS = ("rgb", "depth", "groundtruth")
@@ -72,18 +69,6 @@ def test_an_unknown_folder_takes_intrinsics(tum_root):
     )
     np.testing.assert_allclose(of_1000.intrinsics, (250, 250, 159.75, 119.75))
     np.testing.assert_allclose(of_1000[0].depth, 5 * of_5000[0].depth, rtol=1e-5)
-
-
-@pytest.mark.parametrize("key", ["freiburg1", "freiburg2"])
-def test_undistorted_pixels_see_what_the_distorted_camera_saw(key):
-    intrinsics, distortion = CALIBRATIONS[key]
-    (fx, fy, cx, cy), maps, _ = undistortion(Calibration(intrinsics, distortion), (640, 480))
-    pixels = np.array([[10, 20], [320, 240], [600, 450]])
-    rays = np.column_stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, np.ones(3)])
-    old = np.array([[intrinsics[0], 0, intrinsics[2]], [0, intrinsics[1], intrinsics[3]], [0, 0, 1]])
-    seen, _ = cv2.projectPoints(rays, np.zeros(3), np.zeros(3), old, np.array(distortion))
-    np.testing.assert_allclose([m[pixels[:, 1], pixels[:, 0]] for m in maps], seen[:, 0].T, atol=1e-2)
-    assert maps[0].min() >= -1 and maps[0].max() <= 640 and maps[1].min() >= -1 and maps[1].max() <= 480
 
 
 def test_freiburg1_images_are_undistorted_and_freiburg3_images_are_not(tum_root):

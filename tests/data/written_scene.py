@@ -37,6 +37,19 @@ def color_image(index: int, size: tuple[int, int]) -> np.ndarray:
     return np.stack([u * 120 // size[0], v * 120 // size[1], np.full(u.shape, 40 * index + 20)], -1).astype(np.uint8)
 
 
+def dots(pixels: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """An RGB image of soft white dots."""
+    u, v = np.meshgrid(np.arange(size[0]), np.arange(size[1]))
+    spots = sum(np.exp(-((u - x) ** 2 + (v - y) ** 2) / 4) for x, y in pixels)
+    return np.repeat(np.rint(255 * np.minimum(spots, 1))[..., None], 3, axis=-1).astype(np.uint8)
+
+
+def center_of_dot(image: np.ndarray, near: tuple[float, float]) -> np.ndarray:
+    u, v = np.meshgrid(np.arange(image.shape[1]), np.arange(image.shape[0]))
+    weight = image[..., 0] * ((u - near[0]) ** 2 + (v - near[1]) ** 2 < 64.0)
+    return np.array([(weight * u).sum(), (weight * v).sum()]) / weight.sum()
+
+
 def moved(dataset, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
     """Pixels (row, column) of frame i that have depth, and where frame j shows them: column, row and z."""
     a, (fx, fy, cx, cy) = dataset[i], dataset.intrinsics

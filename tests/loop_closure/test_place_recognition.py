@@ -8,13 +8,12 @@ from loop_scene import INTRINSICS, SIZE, looks, place_recognition_config
 
 from emgs_jax.keypoints.sift import detect
 from emgs_jax.loop_closure.place_recognition import (
-    Candidate,
     Database,
     Keyframe,
     add_keyframe,
     make_keyframe,
     propose_candidates,
-    train_vocabulary,
+    train_words,
     unit_descriptors,
     vlad,
 )
@@ -87,9 +86,6 @@ def test_what_does_not_fit_is_refused():
     database = add_keyframe(Database(), as_keyframe(5, range(100)), place_recognition_config())
     with pytest.raises(ValueError, match="must come after 5"):
         add_keyframe(database, as_keyframe(5, range(100)), place_recognition_config())
-    for word in ("quantile=1.5", "num_neighbours=0"):
-        with pytest.raises(Exception, match=word.split("=")[0]):
-            place_recognition_config(word)
 
 
 def test_vlad_is_the_normalised_root_of_normalised_residuals_and_each_word_counts_once():
@@ -131,8 +127,7 @@ def test_the_place_of_a_lap_before_is_the_first_candidate_and_one_that_was_never
     database, config = walk(55, lap=40)
     for row in (45, 50, 54):
         best = propose_candidates(database, row, config)[0]
-        assert database.keyframes[best.row].frame == row - 40
-        np.testing.assert_allclose(best.score, 1.0, atol=1e-5)
+        assert database.keyframes[best].frame == row - 40
     assert all(propose_candidates(database, row, config) == [] for row in range(40))
 
 
@@ -150,7 +145,7 @@ def test_candidates_are_old_apart_in_time_few_and_the_most_alike_first():
 
     def proposed(suppressed_gap):
         found = propose_candidates(database, 8, place_recognition_config(*words, f"suppressed_gap={suppressed_gap}"))
-        return [frames[one.row] for one in found]
+        return [frames[row] for row in found]
 
     assert proposed(0) == [44, 40]  # not 80, which is too new
     assert proposed(4) == [44, 4]
@@ -160,9 +155,7 @@ def test_candidates_are_old_apart_in_time_few_and_the_most_alike_first():
 def test_the_threshold_is_that_quantile_of_the_similarity_to_the_last_neighbours():
     database = alike((0, 100, 197, 198, 200), (0.7, 0.6, 0.5, 0.9, 1.0))
     config = place_recognition_config("num_neighbours=2", "quantile=0.5", "min_gap=50")
-    assert propose_candidates(database, 4, config) == [
-        Candidate(0, pytest.approx(0.7))
-    ]  # (.5 + .9) / 2 lets .7 pass, not .6
+    assert propose_candidates(database, 4, config) == [0], "(.5 + .9) / 2 lets .7 pass, not .6"
     assert propose_candidates(database, 4, dataclasses.replace(config, quantile=0.6)) == []
     assert len(propose_candidates(database, 4, dataclasses.replace(config, quantile=0.0))) == 2
     assert propose_candidates(database, 0, config) == []
@@ -202,7 +195,4 @@ def test_it_is_the_same_each_time():
     np.testing.assert_array_equal(one.descriptors, other.descriptors)
     np.testing.assert_array_equal(one.points, other.points)
     sample = unit_descriptors(one)
-    assert not np.array_equal(
-        train_vocabulary(sample, place_recognition_config()),
-        train_vocabulary(sample, place_recognition_config("seed=1")),
-    )
+    assert not np.array_equal(train_words(sample, (16, 1000, 5), 0), train_words(sample, (16, 1000, 5), 1))

@@ -7,12 +7,12 @@ import pytest
 from tiny_run import compose, map_tiny
 
 from emgs_jax.config.configure import build
-from emgs_jax.data import furniture, room
+from emgs_jax.data import furniture
 from emgs_jax.data.base import MOVES
 from emgs_jax.data.looks import draw_looks
 from emgs_jax.data.movers import Mover
 from emgs_jax.data.raycast import RayCast, Scene
-from emgs_jax.data.synthetic import camera_path
+from emgs_jax.data.synthetic import build_room, camera_path
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.mapping.records import HIDDEN
 
@@ -22,18 +22,19 @@ NUM_FRAMES, HIDING = 20, range(8, 11)
 class Stage(RayCast):
     """The room before a camera that stands, and a board (w, h) that stands at `places` in its view."""
 
-    name, classes, version = "stage", room.CLASSES, 1
+    name, classes, version = "stage", furniture.CLASSES, 1
 
     def __init__(self, size, places) -> None:
         rng = np.random.default_rng(3)
-        parts, room_size = room.build_room(rng)
+        parts, room_size = build_room(rng)
         poses = np.repeat(camera_path(40, room_size, rng)[:1], NUM_FRAMES, axis=0)
         T_camera_board = np.tile(np.eye(4), (NUM_FRAMES, 1, 1))
         T_camera_board[:, :3, 3] = places
         (board,) = furniture.join("box", furniture.box((*size, 0.1), (0, 0, 0)))
         mover = Mover(board, poses @ T_camera_board, np.full(NUM_FRAMES, MOVES, np.uint8))
         scene = Scene(parts, draw_looks(parts, rng))
-        super().__init__("stage", scene, poses, range(NUM_FRAMES), (64, 48), None, [mover])
+        super().__init__(size=(64, 48))
+        self._show("stage", scene, poses, [mover])
 
 
 AWAY = np.array([0.0, 0.0, -5.0])  # behind the camera

@@ -7,6 +7,7 @@ import hydra
 import jax
 import numpy as np
 import pytest
+from scene import slam_config
 from scipy.spatial import cKDTree
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose, dataset, exact, map_tiny
 
@@ -17,8 +18,9 @@ from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import ground_truth_cloud
 from emgs_jax.mapping import pipeline
 from emgs_jax.mapping.pipeline import finish_run, map_frames
-from emgs_jax.mapping.run import new_run
+from emgs_jax.mapping.run import clamped, new_run
 from emgs_jax.mapping.window_input import predictions, window_inputs
+from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.dense import dense_map
 from emgs_jax.report.gathering import RawPrior
@@ -235,3 +237,16 @@ def test_the_map_does_not_start_at_the_origin_but_at_the_first_true_pose_and_at_
     expected = np.stack([origin @ pose for pose in exact()[0].poses])
     np.testing.assert_allclose(session.poses, expected, atol=1e-3)
     assert session.true_poses == [None] * NUM_FRAMES
+
+
+@pytest.mark.parametrize(("given", "is_said"), [(8, True), (20, True), (169, False), (200, False)])
+def test_a_setting_that_images_of_this_size_bound_is_named(given, is_said):
+    """λ of 20 and of 8 made one map of images of 160×120, without a word."""
+    config = slam_config("slam.observation.thin=2", f"slam.fit.points_per_gaussian={given}")
+    said = clamped(config, Camera([150.0, 150.0], [79.5, 59.5], 160, 120))
+    assert bool(said) == is_said and all(f"points_per_gaussian={given} makes the Gaussians of 169" in x for x in said)
+    (both,) = clamped(
+        slam_config("slam.em.num_neighbours=16", "slam.em.num_candidates=8"),
+        Camera([150.0] * 2, [79.5, 59.5], 640, 480),
+    )
+    assert "num_candidates=8" in both

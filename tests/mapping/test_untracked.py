@@ -45,16 +45,15 @@ def test_frames_before_there_is_a_map_count_too():
     assert list(said("l" * 12 + "i")) == [MANY_IN_A_ROW - 1, 12]
 
 
-def test_a_map_that_begins_anew_is_said_once():
-    rows = records("it" + "d" * 5 + "it")
-    rows[7] = replace(rows[7], location="restarted")
-    texts = [alarm(rows[: place + 1]) for place in range(len(rows))]
-    assert [place for place, text in enumerate(texts) if text] == [7]
-    assert texts[7].startswith("7.jpg: relocalization fails")
-
-
-@pytest.mark.parametrize(("location", "words"), [("new_submap", "a new map begins"), ("joined", "both are one map")])
-def test_where_a_part_begins_and_where_it_is_joined_is_said_once(location, words):
+@pytest.mark.parametrize(
+    ("location", "words"),
+    [
+        ("restarted", "6.jpg: relocalization fails"),
+        ("new_submap", "a new map begins"),
+        ("joined", "both are one map"),
+    ],
+)
+def test_where_a_map_restarts_or_begins_and_where_two_are_joined_is_said_once(location, words):
     rows = records("it" + "l" * 4 + "ittt")
     rows[6] = replace(rows[6], location=location)
     texts = [alarm(rows[: place + 1]) for place in range(len(rows))]

@@ -110,7 +110,7 @@ def test_outer_is_what_it_says():
 
 
 def test_a_tangent_basis_is_orthonormal_for_every_normal_poles_included():
-    normals = np.concatenate([RNG.normal(size=(200, 3)), np.eye(3), -np.eye(3), [[1e-4, 0, -1]]])
+    normals = np.concatenate([RNG.normal(size=(200, 3)), np.eye(3), -np.eye(3), [[1e-4, 0, -1], [1e-3, 0, 1]]])
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
     basis = tangent_basis(np.float32(normals))
     frame = np.concatenate([basis, normals[..., None]], axis=-1)

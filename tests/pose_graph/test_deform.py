@@ -71,13 +71,6 @@ def test_a_map_that_moved_is_one_that_can_be_loaded(map, before, tmp_path):
     sc.assert_same(load_map(tmp_path / "map.npz"), new)
 
 
-def test_there_and_back_is_where_it_was(map, before):
-    after = nodes([sc.path_pose(i + 4) for i in range(3)], (0.1, -0.2, 0.05))
-    back = moved_map(moved_map(map, before, after, FLOOR, ALONE), after, before, FLOOR, ALONE)
-    for a, b in zip(jax.tree.leaves(back), jax.tree.leaves(map), strict=True):
-        np.testing.assert_allclose(a, b, atol=1e-5)
-
-
 def test_what_a_camera_saw_at_a_pixel_stays_there_and_is_larger_by_the_scale(map, before):
     """A scale that acts before the new pose; about the world's origin it would move every pixel."""
     after = nodes([sc.path_pose(i + 4) for i in range(3)], (0.1, -0.2, 0.05))
@@ -183,3 +176,19 @@ def test_a_rotation_is_the_same_with_either_sign_of_its_quaternion(map, before):
     other = Nodes(jaxlie.SE3(sc.device(after.T_world.wxyz_xyz * signs)), after.log_scale, after.valid)
     one, two = (moved_map(map, before, known, FLOOR, TOGETHER).gaussians for known in (after, other))
     sc.assert_rows_near(one, two, atol=1e-5)
+
+
+def test_a_node_that_is_not_in_use_may_hold_anything(map, before):
+    """A motion that is not finite, of a neighbour's birth that does not count, was NaN for the Gaussian beside it."""
+    after, is_used = nodes([sc.path_pose(i + 4) for i in range(3)]), np.arange(NUM_NODES) < 2
+
+    def holding(known, value):
+        poses = np.where(is_used[:, None], known.T_world.wxyz_xyz, np.float32(value))
+        scales = np.where(is_used, known.log_scale, np.float32(value))
+        return Nodes(jaxlie.SE3(sc.device(poses)), sc.device(scales), sc.device(is_used))
+
+    known = moved_map(map, holding(before, 0.5), holding(after, 0.5), FLOOR, TOGETHER)
+    own = np.asarray(map.birth) < 2
+    assert (known.gaussians.means != map.gaussians.means)[own].any()
+    for value in (np.nan, 1e30):
+        sc.assert_same(moved_map(map, holding(before, value), holding(after, value), FLOOR, TOGETHER), known)

@@ -33,6 +33,11 @@ def test_a_smooth_field_is_found_in_noise() -> None:
     assert rms(found(TRUE + NOISE) - TRUE) < 0.006
 
 
+def test_where_nothing_differs_and_nothing_may_there_is_no_field() -> None:
+    """`icp.noise=0` with an exact prior: 0 / 0 was the field, and with it all points of a tracked frame."""
+    assert not found(0.0, noise=0.0).any()
+
+
 def test_noise_that_is_not_alike_is_no_field() -> None:
     assert rms(found(5 * NOISE, noise=0.05)) < 0.004
 

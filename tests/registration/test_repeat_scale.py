@@ -1,14 +1,15 @@
 """What the image that was predicted twice says of the scale, and how sure that is."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scene import device, moved_points, observe_room, on_host, path_pose, replace
+from scene import device, moved_points, observe_room, on_host, path_pose, pose, replace
 
 from emgs_jax.observation import transform
 from emgs_jax.ops.camera import Camera
-from emgs_jax.registration.repeated_prediction import repeat_scale
+from emgs_jax.registration.repeated_prediction import repeat_error, repeat_scale
 
 CAMERA = Camera([30.0, 33.0], [19.5, 15.25], 40, 32)
 T, NOW = path_pose(2), observe_room(path_pose(2), CAMERA)
@@ -73,3 +74,23 @@ def test_a_row_that_is_no_point_says_nothing(poison):
     bad, good = replace(NOW, points=points), replace(NOW, points=np.where(valid[:, None], points, 1), valid=valid)
     found, expected = (repeat_scale(one, moved_points(T, one), T, jnp.ones(()), RATIO) for one in (bad, good))
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=1e-7)
+
+
+def test_what_two_equal_predictions_differ_by_has_finite_slopes():
+    """A length has none at 0: those of a whole step with an exact prior were NaN."""
+    before = jax.tree.map(device, moved_points(T, NOW))
+
+    def total(points):
+        same = eqx.tree_at(lambda o: o.points, before, points)
+        return sum(repeat_error(before, same, pose(), jnp.ones(()), jnp.ones(())))
+
+    assert np.isfinite(on_host(jax.grad(total))(before.points)).all()
+
+
+@pytest.mark.parametrize(("factor", "expected"), [(1.0, float(np.sort(np.asarray(NOW.points)[:, 2])[639])), (0.0, 1.0)])
+def test_the_mean_depth_is_the_median_of_the_points_before_the_camera(factor, expected):
+    """Where all points were at the camera, depths were a part of 0 and the whole state NaN."""
+    depths = factor * np.asarray(NOW.points)
+    now, before = replace(NOW, points=depths), moved_points(T, NOW)
+    _, depth = on_host(repeat_error)(now, before, T, device(1.0), device(1.0))
+    assert depth == pytest.approx(expected)

@@ -1,5 +1,7 @@
 """Rigid fits against Umeyama, robust ones against NumPy, screw motions and medians against what they are."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
@@ -102,3 +104,40 @@ def test_exact_pairs_keep_the_pose_that_fits_them():
     source = RNG.uniform(-1, 1, (NUM_PAIRS, 3)).astype(np.float32)
     T = fit_rigid_robust(source, source, np.ones(NUM_PAIRS, bool), pose())
     assert max(pose_error(T, pose())) < 1e-3  # quaternions from float32 matrices
+
+
+SQUARE = np.stack([*np.meshgrid(np.linspace(-1, 1, 6), np.linspace(-1, 1, 6)), np.full((6, 6), 2.0)], -1).reshape(-1, 3)
+CUBE = np.float64(list(np.ndindex(2, 2, 2))) + [0, 0, 3.0]
+
+
+@pytest.mark.parametrize("source", [SQUARE, CUBE, RNG.normal(size=(20, 3))], ids=["square", "cube", "any"])
+def test_slopes_of_a_fit_are_those_of_float64_differences_however_symmetric_the_points_are(source):
+    """Singular values that are equal, as those of a square wall, made all of them NaN."""
+    matrix = matrix_of(pose((0.2, -0.4, 0.3), (1, 2, 3)))
+    weights, direction = RNG.uniform(0.5, 1, len(source)), RNG.normal(size=(2, *source.shape))
+    weights = np.ones(len(source)) if len(source) != 20 else weights
+    ends = source, source @ matrix[:3, :3].T + matrix[:3, 3]
+
+    def placed(source, target):
+        T, scale = rigid.fit_rigid(source, target, jnp.float32(weights))
+        return jnp.append(T.rotation().as_matrix().ravel(), jnp.append(T.translation(), scale))
+
+    def exact(step):
+        R, _, scale = reference.umeyama(ends[0] + step * direction[0], ends[1] + step * direction[1], weights)
+        share = weights / weights.sum()
+        t = share @ (ends[1] + step * direction[1]) - R @ (share @ (ends[0] + step * direction[0]))
+        return np.concatenate([R.ravel(), t, [scale]])
+
+    slopes = on_host(lambda *x: jax.jvp(placed, x[:2], x[2:])[1])(*map(np.float32, (*ends, *direction)))
+    np.testing.assert_allclose(slopes, (exact(1e-5) - exact(-1e-5)) / 2e-5, atol=2e-4)
+
+
+@pytest.mark.parametrize("weight", [0.0, 1.0])
+def test_where_nothing_determines_a_rotation_it_has_no_slope(weight):
+    same = np.ones((16, 3), np.float32)  # whose mean is exact
+
+    def total(source):
+        T, scale = rigid.fit_rigid(source, jnp.asarray(same), jnp.full(16, np.float32(weight)))
+        return jnp.sum(T.rotation().wxyz) + scale
+
+    assert not on_host(jax.grad(total))(same).any()

@@ -1,0 +1,74 @@
+"""Two maps of one wall become one layer half way between them; what only one of them shows stays as it is."""
+
+import equinox as eqx
+import numpy as np
+import pytest
+from scene import device, flat_gaussians, fresh_map, join, on_host
+
+from emgs_jax.gaussian_map import GaussianMap
+from emgs_jax.layers import one_layer
+
+made_one = on_host(one_layer)
+GRID = np.arange(-1.0, 1.01, 0.1)
+FIRST = np.array([(x, y, 3.0) for x in GRID for y in GRID])
+GAP, BEYOND = 0.04, 0.6  # m; the other wall is so far behind the first, and goes on so far beside it
+OTHER = FIRST + [BEYOND, 0.03, GAP]
+NORMAL = (0.0, 0.0, -1.0)
+
+
+def walls(*parts, normal=NORMAL) -> tuple[GaussianMap, np.ndarray]:
+    """Walls of flat Gaussians, and which rows are not the first's."""
+    gaussians = join(*(flat_gaussians(part, 0.05, normal, 0.003) for part in parts))
+    is_other = np.repeat(np.arange(len(parts)) > 0, [len(part) for part in parts])
+    features = np.stack([~is_other, 0.5 * is_other + 0.5], axis=1).astype(float)
+    return fresh_map(eqx.tree_at(lambda g: g.features, gaussians, features), 2.0, 0.5), is_other
+
+
+def after(config, map: GaussianMap, is_other, noise: float = 0.02) -> GaussianMap:
+    return made_one(map, is_other, np.zeros(map.gaussians.means.shape, np.float32), device(noise), config().existence)
+
+
+def test_both_walls_move_half_way_and_the_other_is_fused_into_the_first(config):
+    map, is_other = walls(FIRST, OTHER)
+    one = after(config, map, is_other)
+    old, new, valid = np.asarray(map.gaussians.means), np.asarray(one.gaussians.means), np.asarray(one.gaussians.valid)
+    is_seen_twice = np.where(is_other, old[:, 0] <= 0.95, old[:, 0] >= -0.35)
+    np.testing.assert_allclose(new[valid & is_seen_twice, 2], 3.0 + GAP / 2, atol=2e-3)
+    assert valid[~is_other].all() and not valid[is_other & is_seen_twice].any(), "each is one, in the first's rows"
+    taken = valid & ~is_other & (np.asarray(one.weight) > 2.0)
+    assert one.weight[valid].sum() == map.weight.sum() and np.asarray(one.num_updates)[valid].sum() == len(is_other)
+    np.testing.assert_allclose(np.asarray(one.gaussians.normals)[taken], np.tile(NORMAL, (taken.sum(), 1)), atol=1e-6)
+    across = np.asarray(one.gaussians.covs)[taken][:, 2, 2]
+    np.testing.assert_allclose(across, np.asarray(map.gaussians.covs)[0, 2, 2], rtol=1e-3), "no thicker by two layers"
+
+
+def test_what_only_one_of_both_shows_stays_and_no_step_is_between(config):
+    map, is_other = walls(FIRST, OTHER)
+    one = after(config, map, is_other)
+    old, new, valid = np.asarray(map.gaussians.means), np.asarray(one.gaussians.means), np.asarray(one.gaussians.valid)
+    alone = valid & np.where(is_other, old[:, 0] > 1.35, old[:, 0] < -0.75)
+    assert alone[is_other].any() and alone[~is_other].any()
+    np.testing.assert_array_equal(new[alone], old[alone])
+    between = valid & ~is_other & (old[:, 0] < -0.4)
+    steps = new[between, 2] - 3.0
+    assert (steps >= 0).all() and (steps < GAP / 2).any() and (steps > GAP / 4).any()
+
+
+@pytest.mark.parametrize(
+    ("parts", "change", "words"),
+    [
+        ((FIRST, OTHER + [0, 0, 0.5]), {}, ()),  # another wall, eight standard deviations behind
+        ((FIRST, OTHER), {"normal": [NORMAL, (0.0, 0.0, 1.0)]}, ()),  # the other side of it
+        ((FIRST, OTHER), {}, ("slam/existence=paper",)),
+    ],
+)
+def test_what_is_no_second_layer_stays(config, parts, change, words):
+    map, is_other = walls(*parts)
+    if "normal" in change:
+        normals = np.float32(change["normal"])[is_other.astype(int)]
+        map = eqx.tree_at(lambda m: m.gaussians.normals, map, normals)
+    one = made_one(
+        map, is_other, np.zeros(map.gaussians.means.shape, np.float32), device(0.02), config(*words).existence
+    )
+    np.testing.assert_array_equal(one.gaussians.means, map.gaussians.means)
+    assert np.asarray(one.gaussians.valid).all()
