@@ -1,7 +1,7 @@
 """The map M: Gaussians of fixed capacity with the weight of their running average, and its submaps."""
 
 import math
-from dataclasses import fields
+from dataclasses import fields, replace
 from typing import Any
 
 import equinox as eqx
@@ -163,7 +163,7 @@ def update_average(
     gain = jnp.where(has_evidence, evidence / jnp.where(has_evidence, kept, 1.0), 0.0)
     weight = jnp.where(has_evidence, jnp.where(config.gain > 0, kept, gain), map.weight)
     blended = where_rows(has_evidence, blend(map.gaussians, new, gain, config.blend), map.gaussians)
-    return GaussianMap(blended, weight, map.num_updates + has_evidence, map.existence, map.birth), gain
+    return replace(map, gaussians=blended, weight=weight, num_updates=map.num_updates + has_evidence), gain
 
 
 def select_submap(

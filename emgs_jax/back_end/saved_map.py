@@ -42,14 +42,14 @@ class SavedMap:
         map: of an earlier run.
         back_end: of that run; its `first_node` is that of the next one.
         depth_noise: how much a frame differed from the map, as a fraction of its depth.
-        is_fixed: True in localization mode: the map stays as it is.
+        is_frozen: True in localization mode: the map stays as it is.
         checksum: of its files.
     """
 
     map: GaussianMap
     back_end: BackEnd
     depth_noise: float
-    is_fixed: bool
+    is_frozen: bool
     checksum: str
 
     @property

@@ -20,21 +20,29 @@ MIN_POSE = 6  # points that a pose needs
 
 
 class Gate(StrEnum):
-    """Reasons to reject a loop candidate, in the order in which the gates are tested."""
+    """Reasons to reject a loop candidate, in the order in which the gates are tested, each with words for people."""
 
-    MATCHES = "matches"  # too few that fit an essential matrix
-    MATCH_SHARE = "match_share"  # too many that do not
-    POSE = "pose"  # too few points of the one fit the image of the other
-    POSES_DISAGREE = "poses_disagree"  # found from the points of the one, and of the other
-    HULL = "hull"  # seen in a small part of an image
-    COLLINEAR = "collinear"
-    SMALL = "small"  # all on one small object
-    DEPTHS = "depths"  # their ratios scatter
-    SCALE = "scale"  # not that of a metric prior
-    NEIGHBOURS = "neighbours"  # too few of the candidate's neighbours were verified
-    NEIGHBOURS_DISAGREE = "neighbours_disagree"
-    FREE_SPACE = "contradicted"  # one camera sees through what the other sees
-    PRIOR_QUERY = "revisit"  # a prediction with views of both visits differs
+    words: str
+
+    def __new__(cls, name: str, words: str) -> "Gate":
+        """Make the gate that files call by a name."""
+        gate = str.__new__(cls, name)
+        gate._value_, gate.words = name, words
+        return gate
+
+    MATCHES = "matches", "too few matches fit one motion of the camera"
+    MATCH_SHARE = "match_share", "too many matches do not fit one motion of the camera"
+    POSE = "pose", "too few points of the one fit the image of the other"
+    POSES_DISAGREE = "poses_disagree", "the pose from the points of the one is not that from those of the other"
+    HULL = "hull", "what both show is in a small part of an image"
+    COLLINEAR = "collinear", "what both show lies on a line"
+    SMALL = "small", "what both show is one small object"
+    DEPTHS = "depths", "the ratios of the depths scatter"
+    SCALE = "scale", "the scale is not that of a metric prior"
+    NEIGHBOURS = "neighbours", "too few of the neighbouring frames are verified as well"
+    NEIGHBOURS_DISAGREE = "neighbours_disagree", "the neighbouring frames say otherwise"
+    FREE_SPACE = "contradicted", "the one looks through what the other sees"
+    PRIOR_QUERY = "revisit", "the prior, asked for both together, says otherwise"
 
 
 @dataclass(frozen=True)

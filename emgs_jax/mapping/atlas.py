@@ -33,14 +33,14 @@ class World:
     """A world of the prior in the submap that is mapped in it.
 
     Args:
-        number: `WindowInput.structure`; 0: that of the first frame.
-        T_world_structure: its pose (4, 4); None: that of the first frame, which predictions have already.
+        number: `WindowInput.world`; 0: that of the first frame.
+        T_world_prior: its pose (4, 4); None: that of the first frame, which predictions have already.
         T_world_anchor: (4, 4) of the frame about which its lengths are scaled; None likewise.
         motion: of it since relocalization; None: the identity.
     """
 
     number: int = 0
-    T_world_structure: np.ndarray | None = None
+    T_world_prior: np.ndarray | None = None
     T_world_anchor: np.ndarray | None = None
     motion: jaxlie.SE3 | None = None
 
@@ -68,7 +68,7 @@ def unvisited(saved: SavedMap, camera: Camera, config: SlamConfig) -> Submap:
     arrays = (jnp.zeros((size, columns)) for columns in (3, 3, 3, width))
     nothing = Observation(*arrays, jnp.zeros(size), jnp.zeros(size, bool))
     known = nothing, jaxlie.SE3.identity(), estimate, time, no_looks(nothing, config.motion)
-    return Submap(SlamState(saved.map, *known), saved.is_fixed)
+    return Submap(SlamState(saved.map, *known), saved.is_frozen)
 
 
 @dataclass(frozen=True)

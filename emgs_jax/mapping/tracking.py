@@ -113,13 +113,13 @@ def covariance_of_map(graph: BackEnd, pose: np.ndarray, origin: int | None) -> n
 
 def is_related(world: World, window: WindowInput) -> bool:
     """Test whether the predicted poses are in this world."""
-    return window.structure == world.number
+    return window.world == world.number
 
 
 def place_world(window: WindowInput, pose: np.ndarray) -> World:
     """Place the world of an input by the pose of its frame in the map; lengths are scaled about that frame."""
     own = window.T_anchor_views.get(window.frames[0].index, UNKNOWN)
-    return World(window.structure, pose @ np.linalg.inv(own), pose)
+    return World(window.world, pose @ np.linalg.inv(own), pose)
 
 
 def anchor_world(world: World, window: WindowInput, pose: np.ndarray, scale: float) -> World:
@@ -133,11 +133,11 @@ def anchor_world(world: World, window: WindowInput, pose: np.ndarray, scale: flo
 def step_prediction(world: World, window: WindowInput) -> Prediction:
     """Return a step's prediction in the world of the map; without poses where they are not related to it."""
     prediction = as_step_prediction(window.prediction)
-    if world.T_world_structure is None or not is_related(world, window):
+    if world.T_world_prior is None or not is_related(world, window):
         return prediction
     here = window.frames[0].index
     rows = here - 1, here, here + int(prediction.has_newest)
-    T_world_views = world.T_world_structure @ np.stack([window.T_anchor_views.get(row, UNKNOWN) for row in rows])
+    T_world_views = world.T_world_prior @ np.stack([window.T_anchor_views.get(row, UNKNOWN) for row in rows])
     return replace(prediction, T_world_views=to_se3(T_world_views), T_world_anchor=to_se3(world.T_world_anchor))
 
 
@@ -213,14 +213,14 @@ def return_to_world(atlas: Atlas, window: WindowInput) -> Atlas:
 
     Nothing of the frame before is known there: the step starts at the pose that the prior predicts.
     """
-    known = (number for number, submap in atlas.submaps.items() if window.structure in submap.worlds)
+    known = (number for number, submap in atlas.submaps.items() if window.world in submap.worlds)
     number = None if atlas.state is None or is_related(atlas.world, window) else next(known, None)
     if number is None:
         return atlas
     submap, time = atlas.submaps[number], atlas.state.time
     previous = replace(submap.state.previous, valid=jnp.zeros_like(submap.state.previous.valid))
     atlas = replace(_with_world_left(atlas), graph=replace(atlas.graph, active=number))
-    atlas = replace(atlas, world=submap.worlds[window.structure])
+    atlas = replace(atlas, world=submap.worlds[window.world])
     return with_state(atlas, replace(atlas.state, previous=previous, time=time), atlas.config)
 
 

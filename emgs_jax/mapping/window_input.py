@@ -44,7 +44,7 @@ class WindowInput:
         T_world_anchor: known pose of the first frame; NaN where the inference is not related to it.
         T_anchor_views: predicted pose of every view of the window, by frame index.
         seconds: of the conversion.
-        structure: number of the world that `T_anchor_views` are in, see `PriorPrediction`; 0: that of the first frame.
+        world: number of the world that `T_anchor_views` are in, see `PriorPrediction`; 0: that of the first frame.
             For any other, `prediction` has no pose: the camera's pose in the world is not known.
     """
 
@@ -54,7 +54,7 @@ class WindowInput:
     T_world_anchor: np.ndarray
     T_anchor_views: Mapping[int, np.ndarray]
     seconds: Mapping[str, float]
-    structure: int = 0
+    world: int = 0
 
     @property
     def data(self) -> list[FrameData]:
@@ -78,19 +78,19 @@ def window_inputs(
     """
     forget_replaced()
     done: dict[int, np.ndarray] = {}  # raw poses
-    is_started, clock, structure, known = False, clock or Clock(), 0, set()
+    is_started, clock, world, known = False, clock or Clock(), 0, set()
     for prediction, frames in predictions(dataset, prior, config.window_size, clock):
         check_unit(prediction)
         here = {index for index, pose in _poses(prediction).items() if np.isfinite(pose).all()}
-        structure += bool(is_started and known and here and not here & known)
+        world += bool(is_started and known and here and not here & known)
         known = here or known
-        structure = structure if prediction.world is None else prediction.world
+        world = world if prediction.world is None else prediction.world
         with clock.phase("map"):
             anchor = first_pose(frames)
-            raw = _raw_views(prediction, frames, anchor, structure, done, config)
+            raw = _raw_views(prediction, frames, anchor, world, done, config)
             convert = _step if is_started else _opening
-            known_anchor = np.full((4, 4), np.nan) if structure else anchor
-            found = convert(PredictedWindow(prediction, frames, known_anchor, raw, structure), config, Timer(clock))
+            known_anchor = np.full((4, 4), np.nan) if world else anchor
+            found = convert(PredictedWindow(prediction, frames, known_anchor, raw, world), config, Timer(clock))
         yield from found
         done |= {index: view.T_world_camera for index, view in raw.items()}
         is_started = found[-1].prediction is not None
@@ -126,7 +126,7 @@ class PredictedWindow(NamedTuple):
     frames: Mapping[int, Frame]
     T_world_anchor: np.ndarray
     raw: Mapping[int, RawView]
-    structure: int
+    world: int
 
     def input(
         self, indices: Sequence[int], prediction: FirstWindow | Prediction | None, seconds: Mapping[str, float] = {}
@@ -134,7 +134,7 @@ class PredictedWindow(NamedTuple):
         """Make an input of some of its frames."""
         frames, raw = (tuple(values[index] for index in indices) for values in (self.frames, self.raw))
         poses = _poses(self.prediction)
-        return WindowInput(frames, raw, prediction, self.T_world_anchor, poses, seconds, self.structure)
+        return WindowInput(frames, raw, prediction, self.T_world_anchor, poses, seconds, self.world)
 
 
 def _step(window: PredictedWindow, config: SlamConfig, timer: Timer) -> list[WindowInput]:
@@ -163,7 +163,7 @@ def _raw_views(
     prediction: PriorPrediction,
     frames: Mapping[int, Frame],
     anchor: np.ndarray,
-    structure: int,
+    world: int,
     done: dict[int, np.ndarray],
     config: SlamConfig,
 ) -> dict[int, RawView]:
@@ -176,7 +176,7 @@ def _raw_views(
         given = prediction.mask[row] & ~(confidence < float(config.observation.min_confidence))
         is_sound = (np.abs(points) < MAX_LENGTH_M).all(axis=-1) & (points[..., 2] > 0) & np.isfinite(confidence)
         mask = given & is_sound
-        pose = anchor @ _poses(prediction)[index] if structure == 0 else _pose_after(prediction, index, known)
+        pose = anchor @ _poses(prediction)[index] if world == 0 else _pose_after(prediction, index, known)
         if not np.isfinite(pose).all():
             pose, mask = known.get(index - 1, anchor), np.zeros_like(mask)
         image, features = frames[index].image, prediction.features[row]

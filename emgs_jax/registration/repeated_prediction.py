@@ -6,7 +6,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float
 
 from emgs_jax.observation import Observation, Prediction, depth_in, sound, transform
-from emgs_jax.ops.camera import Camera, nearest_pixel, project
+from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.constants import MAD_TO_STD
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import stack
@@ -37,7 +37,8 @@ def repeat_scale(
             similarity that fits best).
     """
     now, before = sound(now), sound(before)
-    paired, depth_now = now.valid & before.valid & (now.points[:, 2] > 0), now.points[:, 2]
+    depth_now = now.points[:, 2]
+    paired = now.valid & before.valid & (depth_now > NEAREST_DEPTH)
     ratios = depth_in(T_world_previous, before) / jnp.where(paired, depth_now, 1.0)
     ratio = median(ratios, paired)
     is_positive = ratio > 0
@@ -65,7 +66,7 @@ def repeat_error(
     Without a pair nothing is known, and `max_pair_distance` (fraction of the depth) stands in.
     """
     paired, depth = now.valid & before.valid, now.points[:, 2]
-    mean_depth = scale * median(depth, now.valid & (depth > 0))
+    mean_depth = scale * median(depth, now.valid & (depth > NEAREST_DEPTH))
     apart = transform(T_world_previous, now, scale).points - before.points
     differs = jnp.any(apart != 0, axis=-1)  # a length has no gradient where it is 0
     apart = jnp.where(differs, jnp.linalg.norm(jnp.where(differs[:, None], apart, 1.0), axis=-1), 0.0)

@@ -56,7 +56,7 @@ def mergeable(folder: Path) -> MergeableRun:
     records = tuple(record_of(line, pose) for line, pose in zip(run.frames, run.poses, strict=True))
     end, lost = with_records(end, records, run.online)
     slam = replace(slam, submap=replace(slam.submap, map_capacity=run.map.weight.shape[0]))
-    known = unvisited(SavedMap(run.map, end, depth_noise, is_fixed=False, checksum=""), run.camera, slam)
+    known = unvisited(SavedMap(run.map, end, depth_noise, is_frozen=False, checksum=""), run.camera, slam)
     return MergeableRun(run, with_lost(Atlas(run.camera, slam, end, {0: known}), lost), records)
 
 

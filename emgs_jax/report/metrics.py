@@ -222,7 +222,7 @@ def describe(run: MappingRun, dataset: ReadableFrames | None = None) -> Metrics:
     metrics["frames/skipped"] = 0 if dataset is None else len(dataset.skipped)
     for number in run.apart:
         metrics |= _submap_metrics(run, number)
-    metrics["segments/unjoined_frames"] = sum(record.reason == UNJOINED for record in run.records)
+    metrics["submaps/unjoined_frames"] = sum(record.reason == UNJOINED for record in run.records)
     row = longest_row(run.records)
     metrics["frames/longest_untracked"] = len(row)
     start = run.records[row[0]].index if row else None

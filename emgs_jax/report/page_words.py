@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+from emgs_jax.loop_closure.two_view_alignment import Gate
 from emgs_jax.mapping.records import APART
 from emgs_jax.report import columns
 from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
@@ -47,21 +48,7 @@ POLISHED = (  # key of polish.json, words, digits
     ("depth_l1_m", "depth L1, m", 3),
     ("ate_m", "ATE of all frames, m", 4),
 )
-GATES = {
-    "matches": "too few matches fit one motion of the camera",
-    "match_share": "too many matches do not fit one motion of the camera",
-    "pose": "too few points of the one fit the image of the other",
-    "poses_disagree": "the pose from the points of the one is not that from those of the other",
-    "hull": "what both show is in a small part of an image",
-    "collinear": "what both show lies on a line",
-    "small": "what both show is one small object",
-    "depths": "the ratios of the depths scatter",
-    "scale": "the scale is not that of a metric prior",
-    "neighbours": "too few of the neighbouring frames are verified as well",
-    "neighbours_disagree": "the neighbouring frames say otherwise",
-    "contradicted": "the one looks through what the other sees",
-    "revisit": "the prior, asked for both together, says otherwise",
-}
+GATES = {gate.value: gate.words for gate in Gate}
 OUTCOMES = {
     "accepted": "accepted",
     "known": "verified; the poses said so already",

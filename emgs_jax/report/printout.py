@@ -74,7 +74,7 @@ def last_words(metrics: Mapping[str, Any]) -> str:
     others = ("tracked", "initialization", "skipped", APART)
     whole = count + sum(metrics.get(f"frames/{status}", 0) for status in others)
     row, start = metrics["frames/longest_untracked"], metrics["frames/longest_untracked_from"]
-    apart = metrics["segments/unjoined_frames"]
+    apart = metrics["submaps/unjoined_frames"]
     words = f", {apart} are in submaps that were never joined with the map" if apart else ""
     return f"{count} of {whole} frames are degraded or lost, {row} in a row from frame {start} on{words}; "
 

@@ -348,12 +348,16 @@ def with_keyframes(end: BackEnd) -> BackEnd:
     return replace(end, database=Database(keyframes))
 
 
-def test_a_loop_that_the_prior_sees_too_is_more_certain_and_asked_for_once(graph):
-    truth = ring()
+@pytest.fixture
+def drifted(graph) -> BackEnd:
+    """A walk of keyframes with a drift, and four loops that are right."""
     end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
-    end = changed(end, frame=[100 + row for row in range(COUNT)])  # numbers of the data set
-    ask, calls = told_again(np.concatenate([np.tile(np.eye(4), (100, 1, 1)), truth]))
-    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
+    return replace(end, verified=[loop(ring(), row) for row in range(1, 5)])
+
+
+def test_a_loop_that_the_prior_sees_too_is_more_certain_and_asked_for_once(drifted):
+    end = changed(drifted, frame=[100 + row for row in range(COUNT)])  # numbers of the data set
+    ask, calls = told_again(np.concatenate([np.tile(np.eye(4), (100, 1, 1)), ring()]))
     loops = list(end.verified)
     end = query_prior(end, loops[:2], ask)
     assert calls == [(101, 158), (102, 157)] and counts(end)["loops/measured_again"] == 2
@@ -364,10 +368,9 @@ def test_a_loop_that_the_prior_sees_too_is_more_certain_and_asked_for_once(graph
     assert len(calls) == 4 and len(end.verified) == 4 and revisit_note(end) == []
 
 
-def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph):
+def test_of_a_closure_the_loops_with_most_inliers_are_asked_for(graph, drifted):
     truth = ring()
-    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
-    end = replace(end, verified=[replace(loop(truth, row), num_inliers=40 + 10 * (row % 3)) for row in range(1, 7)])
+    end = replace(drifted, verified=[replace(loop(truth, row), num_inliers=40 + 10 * (row % 3)) for row in range(1, 7)])
     ask, calls = told_again(truth)
     end = query_prior(end, end.verified, ask)
     assert [a for a, _ in calls] == [2, 5, 1] and graph.prior_query.max_queries == 3
@@ -392,12 +395,8 @@ def test_what_is_known_already_takes_nobodys_turn(graph):
     assert [one.a for one in violated(end, end.verified)] == [8], "asked for, the prior says what the poses say"
 
 
-def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
-    truth = ring()
-    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
-    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
-    ask, _ = told_again(truth, off=6.0)
-    end = query_prior(end, end.verified[:1], ask)
+def test_a_loop_of_another_place_is_refused_by_the_prior(graph, drifted):
+    end = query_prior(drifted, drifted.verified[:1], told_again(ring(), off=6.0)[0])
     assert [known.a for known in end.verified] == [2, 3, 4] and [known.a for known in end.violating] == [1]
     (refusal,) = end.refusals
     assert (refusal.a, refusal.b, refusal.gate) == (
@@ -410,27 +409,21 @@ def test_a_loop_of_another_place_is_refused_by_the_prior(graph):
     assert "the prior, asked for both together, says otherwise" in loop_why(line)
 
 
-def test_an_answer_without_a_pose_is_none_and_is_counted(graph):
-    truth = ring()
-    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
-    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
-    loops, (ask, _) = list(end.verified), told_again(truth)
-    end = query_prior(end, loops[:1], lambda a, b: replace(ask(a, b), T_a_b=np.full((4, 4), np.nan)))
+def test_an_answer_without_a_pose_is_none_and_is_counted(drifted):
+    loops, (ask, _) = drifted.verified, told_again(ring())
+    end = query_prior(drifted, loops[:1], lambda a, b: replace(ask(a, b), T_a_b=np.full((4, 4), np.nan)))
     assert end.verified == loops and counts(end)["loops/unusable_answers"] == 1
     assert counts(end)["loops/measured_again"] == 0 and revisit_note(end) == []
 
 
-def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(graph):
-    truth = ring()
-    end = with_keyframes(walked(graph, ring(1.95 * np.pi)))
-    end = replace(end, verified=[loop(truth, row) for row in range(1, 5)])
-    loops = list(end.verified)
-    end = query_prior(end, loops[:2], lambda a, b: None)
+def test_a_loop_for_which_the_prior_has_no_word_and_one_of_another_run_stay(drifted):
+    loops = drifted.verified
+    end = query_prior(drifted, loops[:2], lambda a, b: None)
     assert counts(end)["loops/measured_again"] == counts(end)["loops/unusable_answers"] == 0
     (note,) = revisit_note(end)
     assert note.startswith("loops: 2 were measured by keypoints alone") and "graph=default" in note
     assert revisit_note(None) == []
-    ask, calls = told_again(truth)
+    ask, calls = told_again(ring())
     end = replace(end, first_node=10)
     end = query_prior(end, loops[2:], ask)
     assert calls == [] and all(now is before for now, before in zip(end.verified, loops, strict=True))

@@ -128,8 +128,8 @@ def test_a_map_that_was_made_again_is_another_one(folder, graph):
 
 def test_a_folder_is_loaded_with_its_next_node_as_the_first(graph, folder, end):
     saved = load(folder, graph, "localize")
-    assert saved.is_fixed and saved.count == 20 and saved.depth_noise == 0.01
-    assert saved.back_end.first_node == len(end.poses) and not load(folder, graph).is_fixed
+    assert saved.is_frozen and saved.count == 20 and saved.depth_noise == 0.01
+    assert saved.back_end.first_node == len(end.poses) and not load(folder, graph).is_frozen
     assert load_saved_map(None, "extend", None, CAMERA, 0.01) is None
 
 

@@ -57,6 +57,10 @@ def assert_close(a, b):
         assert differs.mean() <= 0.02 and np.abs(a - b).max() < 0.05 * np.abs(b).max(), np.flatnonzero(differs)
 
 
+def runs_of(camera, configs) -> list[MappingRun]:
+    return [MappingRun(Atlas(camera, config, BackEnd(None, (1.0, 1.0, 0.0, 0.0), 0.0))) for config in configs]
+
+
 @pytest.mark.long
 def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_one_is_full(sequence, camera):
     configs, roomy = (
@@ -66,10 +70,7 @@ def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_
             for size in (128, 512)
         )
     )
-    together, alone = (
-        [MappingRun(Atlas(camera, config, BackEnd(None, (1.0, 1.0, 0.0, 0.0), 0.0))) for config in some]
-        for some in (configs, roomy)
-    )
+    together, alone = (runs_of(camera, some) for some in (configs, roomy))
     stacked = make_stack(together)
     for given in sequence:
         stacked = integrate_stack(stacked, given)
@@ -92,10 +93,4 @@ def test_configs_share_a_program_where_only_traced_leaves_differ(camera):
     configs.append(at(base, "observation.min_confidence", 2.0))
     assert programs(configs) == [[0, 1, 3], [2], [4]]
     with pytest.raises(ValueError, match="programs"):
-        next(
-            map_together(
-                [MappingRun(Atlas(camera, config, BackEnd(None, (1.0, 1.0, 0.0, 0.0), 0.0))) for config in configs],
-                dataset(),
-                EditedPrior(),
-            )
-        )
+        next(map_together(runs_of(camera, configs), dataset(), EditedPrior()))

@@ -88,6 +88,15 @@ def in_export(monkeypatch):
         yield
 
 
+@contextlib.contextmanager
+def counted(monkeypatch):
+    """The steps that are taken."""
+    steps, advance = [], tracking.advance
+    with monkeypatch.context() as patch:
+        patch.setattr(tracking, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
+        yield steps
+
+
 @cache
 def whole(*more):
     """Folder and metrics of the run that nobody stops."""
@@ -97,9 +106,7 @@ def whole(*more):
 
 def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) -> None:
     """The same command takes so many steps, and comes to what the run that nobody stopped has."""
-    steps, advance = [], tracking.advance
-    with monkeypatch.context() as patch:
-        patch.setattr(tracking, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
+    with counted(monkeypatch) as steps:
         found = experiments.run.run(compose(*OVERRIDES, *more), folder)
     assert len(steps) in num_steps, "the steps before are not repeated"
     expected, metrics = whole(*more)
@@ -163,9 +170,8 @@ def test_a_scheduler_ends_a_run_with_one_word_and_the_same_command_goes_on(tmp_p
     assert ended(program) == 128 + signal.SIGTERM, said.read_text()
     assert "terminated\n" in said.read_text() and "Traceback" not in said.read_text()
     assert f"the same command with hydra.run.dir={folder} goes on" in said.read_text()
-    steps, advance = [], tracking.advance
-    monkeypatch.setattr(tracking, "advance", lambda *arguments: steps.append(1) or advance(*arguments))
-    experiments.run.run(compose(*OVERRIDES), folder)
+    with counted(monkeypatch) as steps:
+        experiments.run.run(compose(*OVERRIDES), folder)
     assert len(steps) < NUM_FRAMES - 1, "in another process"
     for name in ("map.npz", "trajectory.txt"):
         assert (folder / name).read_bytes() == (whole()[0] / name).read_bytes(), name

@@ -61,7 +61,7 @@ def metrics_of(folder: Path) -> dict:
 
 def test_two_laps_of_two_cameras_in_two_units_become_one_map_that_is_better_than_each(runs):
     first, second, both = (metrics_of(runs / name) for name in ("first", "second", "both"))
-    assert both["trajectory/num_frames"] == both["frames/tracked"] + 2 == 40 and both["segments/unjoined_frames"] == 0
+    assert both["trajectory/num_frames"] == both["frames/tracked"] + 2 == 40 and both["submaps/unjoined_frames"] == 0
     assert both["loops/accepted"] > 10 and both["loops/precision"] == 1
     paths = [one["trajectory/ate_sim3_m"] for one in (first, second)]
     assert both["trajectory/ate_sim3_m"] < np.mean(paths)

@@ -73,13 +73,13 @@ def test_each_frame_is_read_once_just_before_it_is_needed_and_kept_only_while_a_
 @pytest.mark.slow
 @pytest.mark.parametrize("window", [WINDOW_SIZE, 1])
 def test_every_frame_has_one_record_with_its_true_pose_where_the_prior_is_exact(window):
-    session, _ = exact() if window == WINDOW_SIZE else map_tiny(dataset(), EditedPrior(), f"slam.window_size={window}")
-    assert [record.index for record in session.records] == list(range(NUM_FRAMES))
-    assert [record.status for record in session.records] == ["initialization"] + ["tracked"] * (NUM_FRAMES - 1)
+    run, _ = exact() if window == WINDOW_SIZE else map_tiny(dataset(), EditedPrior(), f"slam.window_size={window}")
+    assert [record.index for record in run.records] == list(range(NUM_FRAMES))
+    assert [record.status for record in run.records] == ["initialization"] + ["tracked"] * (NUM_FRAMES - 1)
     truth = np.stack([dataset()[i].T_world_camera for i in range(NUM_FRAMES)])
-    np.testing.assert_allclose(session.poses, truth, atol=1e-3)  # a tenth of the bar
-    np.testing.assert_allclose(session.raw_poses, truth, atol=1e-12)
-    for record, following in zip(session.records[1:], truth[2:], strict=False):
+    np.testing.assert_allclose(run.poses, truth, atol=1e-3)  # a tenth of the bar
+    np.testing.assert_allclose(run.raw_poses, truth, atol=1e-12)
+    for record, following in zip(run.records[1:], truth[2:], strict=False):
         if record.index + 1 != window:  # the last view of the first window has no image after it
             np.testing.assert_allclose(record.newest_pose[:3, 3], following[:3, 3], atol=1e-3)
 
@@ -98,16 +98,16 @@ def test_predictions_without_a_valid_point_or_pose_mark_their_frames_and_leave_t
             prediction = at_inference(number, **arrays)(prediction)
         return prediction
 
-    session, maps = map_tiny(dataset(), EditedPrior(edit))
+    run, maps = map_tiny(dataset(), EditedPrior(edit))
     for number in damages:
         bad = WINDOW_SIZE - 1 + number
-        record = session.records[bad]
+        record = run.records[bad]
         has_pose = "T_anchor_view" not in damages[number]
         assert record.status == ("degraded" if has_pose else "lost") and "no valid point or pose" in record.reason
         assert same_bits(maps[bad], maps[bad - 1])
-    assert (session.records[-1].status == "tracked") == (3 not in damages), "the frame after them is as all are"
-    assert np.isfinite(session.poses).all() and np.isfinite(session.raw_poses).all()
-    gaussians = session.state.map.gaussians
+    assert (run.records[-1].status == "tracked") == (3 not in damages), "the frame after them is as all are"
+    assert np.isfinite(run.poses).all() and np.isfinite(run.raw_poses).all()
+    gaussians = run.state.map.gaussians
     assert np.isfinite(np.asarray(gaussians.means)[np.asarray(gaussians.valid)]).all()
 
 
@@ -119,14 +119,14 @@ def test_a_bad_view_in_the_first_window_is_not_tracked_and_the_others_are(damage
             getattr(prediction, damaged)[1] = np.nan
         return prediction
 
-    session, maps = map_tiny(dataset(), EditedPrior(edit))
-    assert [record.status for record in session.records[:3]] == [
+    run, maps = map_tiny(dataset(), EditedPrior(edit))
+    assert [record.status for record in run.records[:3]] == [
         "initialization",
         "degraded" if damaged == "points" else "lost",
         "tracked",
     ]
     assert same_bits(maps[0], maps[1])
-    found, truth = session.poses[2:], [dataset()[i].T_world_camera for i in range(2, NUM_FRAMES)]
+    found, truth = run.poses[2:], [dataset()[i].T_world_camera for i in range(2, NUM_FRAMES)]
     # The chain is broken, the prior's own pose is not; but how good it is nobody knows, so the tiny map pulls at it.
     np.testing.assert_allclose(found, truth, atol=0.05)
 
@@ -151,13 +151,13 @@ def test_the_map_starts_at_the_first_frame_with_a_point_and_those_before_are_los
                 prediction.mask[row] = False
         return prediction
 
-    session, _ = map_tiny(dataset(), EditedPrior(edit))
+    run, _ = map_tiny(dataset(), EditedPrior(edit))
     expected = ["lost"] * num_empty + ["initialization"] + ["tracked"] * (NUM_FRAMES - num_empty - 1)
-    assert [record.status for record in session.records] == expected
-    assert [record.index for record in session.records] == list(range(NUM_FRAMES))
+    assert [record.status for record in run.records] == expected
+    assert [record.index for record in run.records] == list(range(NUM_FRAMES))
     truth = [dataset()[i].T_world_camera for i in range(NUM_FRAMES)]
-    np.testing.assert_allclose(session.poses[num_empty:], truth[num_empty:], atol=5e-3)
-    np.testing.assert_array_equal(session.poses[:num_empty], [truth[0]] * num_empty)
+    np.testing.assert_allclose(run.poses[num_empty:], truth[num_empty:], atol=5e-3)
+    np.testing.assert_array_equal(run.poses[:num_empty], [truth[0]] * num_empty)
 
 
 def test_a_prior_without_any_point_is_an_error_and_not_a_run_that_never_maps():
@@ -172,30 +172,22 @@ def test_a_sequence_without_frames_is_refused():
         list(window_inputs(empty, Echo(), hydra.utils.instantiate(compose().slam), Clock()))
 
 
-def test_features_without_a_grid_for_each_dense_view_are_refused():
-    def edit(prediction):
-        return replace(prediction, features=prediction.features[0])
-
-    with pytest.raises(ValueError, match=r"features have shape \(48, 64, 16\) at frame 2, expected \(3, rows, columns"):
-        map_tiny(dataset(), EditedPrior(edit))
-
-
 @pytest.mark.slow
 def test_the_merged_initialization_makes_the_map_from_the_whole_window(monkeypatch):
     """Only the first window: `initialization` is static, so a step would be compiled anew."""
     monkeypatch.setattr(pipeline, "prepare_step", lambda *_: None)  # of a step, which there is not
     frames = ReadableFrames(hydra.utils.instantiate(compose(f"dataset.stop={WINDOW_SIZE}").dataset))
-    session, maps = map_tiny(frames, EditedPrior(), "slam.initialization=merged")
-    assert [record.status for record in session.records] == ["initialization"] * WINDOW_SIZE
+    run, maps = map_tiny(frames, EditedPrior(), "slam.initialization=merged")
+    assert [record.status for record in run.records] == ["initialization"] * WINDOW_SIZE
     truth = np.stack([frame.T_world_camera for frame in map(dataset().__getitem__, range(WINDOW_SIZE))])
-    np.testing.assert_allclose(session.poses, truth, atol=1e-5)
-    assert len(maps) == WINDOW_SIZE and maps[0].gaussians.valid.sum() == session.records[-1].num_gaussians > 100
+    np.testing.assert_allclose(run.poses, truth, atol=1e-5)
+    assert len(maps) == WINDOW_SIZE and maps[0].gaussians.valid.sum() == run.records[-1].num_gaussians > 100
 
 
 @pytest.mark.slow
 def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
-    session, _ = exact()
-    blind = replace(session, records=tuple(replace(record, true_pose=None) for record in session.records))
+    run, _ = exact()
+    blind = replace(run, records=tuple(replace(record, true_pose=None) for record in run.records))
     config = hydra.utils.instantiate(compose().densify)
     protocol = hydra.utils.instantiate(compose().evaluation)
     dense = dense_map(blind, dataset(), config, protocol)
@@ -212,9 +204,9 @@ def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
 @pytest.mark.slow
 def test_the_densified_cloud_of_an_exact_run_lies_on_the_true_surfaces():
     """Within the size of a Gaussian: 8 points of about 3 cm spacing."""
-    session, _ = exact()
+    run, _ = exact()
     protocol = hydra.utils.instantiate(compose().evaluation)
-    dense = dense_map(session, dataset(), hydra.utils.instantiate(compose().densify), protocol)
+    dense = dense_map(run, dataset(), hydra.utils.instantiate(compose().densify), protocol)
     truth = ground_truth_cloud(list(dataset()), dataset().intrinsics, protocol)
     distance, _ = cKDTree(truth.points).query(dense.cloud.points)
     assert np.median(distance) < 0.03
@@ -230,13 +222,13 @@ def test_the_map_does_not_start_at_the_origin_but_at_the_first_true_pose_and_at_
         def predict(self, window, frames, intrinsics):
             return super().predict(window, [dataset()[index] for index in window.views], intrinsics)
 
-    session = new_run(Blind(dataset()), exact()[0].config)
-    *_, (session, _, _) = map_frames(session, Blind(dataset()), Knowing())
-    session = finish_run(session)
+    run = new_run(Blind(dataset()), exact()[0].config)
+    *_, (run, _, _) = map_frames(run, Blind(dataset()), Knowing())
+    run = finish_run(run)
     origin = np.linalg.inv(dataset()[0].T_world_camera)
     expected = np.stack([origin @ pose for pose in exact()[0].poses])
-    np.testing.assert_allclose(session.poses, expected, atol=1e-3)
-    assert session.true_poses == [None] * NUM_FRAMES
+    np.testing.assert_allclose(run.poses, expected, atol=1e-3)
+    assert run.true_poses == [None] * NUM_FRAMES
 
 
 @pytest.mark.parametrize(("given", "is_said"), [(8, True), (20, True), (169, False), (200, False)])

@@ -63,7 +63,7 @@ def some_map():
 def saved(map) -> Submap:
     """A saved map of seven frames, before one is found in it."""
     end = SimpleNamespace(nodes=[None] * 7)
-    one = SimpleNamespace(map=map, back_end=end, depth_noise=0.02, is_fixed=False)
+    one = SimpleNamespace(map=map, back_end=end, depth_noise=0.02, is_frozen=False)
     return unvisited(one, CAMERA, load_config().slam)
 
 
@@ -124,15 +124,15 @@ def test_from_then_on_the_prior_says_its_poses_from_where_the_camera_was_found()
     np.testing.assert_allclose(anchor @ relative, PLACE, atol=1e-5)
     assert move_prediction(given, None) is given
     assert np.isnan(there.pose_covariance).all()  # that world is only as sure as the pose that was found
-    anchored = anchor_world(World(), SimpleNamespace(structure=0, prediction=given), PLACE, 1.1)
+    anchored = anchor_world(World(), SimpleNamespace(world=0, prediction=given), PLACE, 1.1)
     np.testing.assert_allclose(anchored.motion.wxyz_xyz, motion.wxyz_xyz, atol=1e-6)
 
 
 def test_a_frame_of_its_own_is_where_the_camera_was_found_and_goes_with_it_from_then_on():
     own = matrix((0, 40, 0), (1, 2, 3))
-    given = SimpleNamespace(structure=2, frames=[SimpleNamespace(index=5)], T_anchor_views={5: own})
+    given = SimpleNamespace(world=2, frames=[SimpleNamespace(index=5)], T_anchor_views={5: own})
     world = anchor_world(World(), given, PLACE, 1.1)
-    np.testing.assert_allclose(world.T_world_structure @ own, PLACE, atol=1e-12)
+    np.testing.assert_allclose(world.T_world_prior @ own, PLACE, atol=1e-12)
     assert world.number == 2
     np.testing.assert_allclose(world.motion.as_matrix(), np.eye(4))  # None would stay behind in a closure
 
@@ -160,7 +160,7 @@ def test_a_camera_is_looked_for_after_some_frames_that_are_not_tracked(num_lost,
 
 
 def begins_anew(
-    chain=((3, 2), (4, 3), (5, 4), (6, 5)), here=(6, 7), repeat_rms=0.01, has_points=True, is_fixed=False, patience=5
+    chain=((3, 2), (4, 3), (5, 4), (6, 5)), here=(6, 7), repeat_rms=0.01, has_points=True, is_frozen=False, patience=5
 ) -> bool:
     """The last five of eight frames, the given one included, are not tracked; without changes all speaks for it."""
     config = load_config("graph=default", f"graph.relocalization.max_patience={patience}")
@@ -174,7 +174,7 @@ def begins_anew(
     state = eqx.tree_at(lambda s: s.previous.valid, state, state.previous.valid & has_points)
     given = SimpleNamespace(frames=[SimpleNamespace(index=7)], T_anchor_views={view: poses[view] for view in here})
     return is_restart_due(
-        SimpleNamespace(graph=end, num_lost=4, is_frozen=is_fixed, config=config.slam),
+        SimpleNamespace(graph=end, num_lost=4, is_frozen=is_frozen, config=config.slam),
         given,
         state,
         SimpleNamespace(localization=found),
@@ -195,7 +195,7 @@ def begins_anew(
         ({"here": (6,)}, False),
         ({"repeat_rms": 1.0}, False),  # the prior says something else each time
         ({"has_points": False}, False),
-        ({"is_fixed": True}, False),
+        ({"is_frozen": True}, False),
     ],
 )
 def test_a_map_begins_anew_only_where_the_prior_leads_and_knows_what_it_sees(changes, expected):

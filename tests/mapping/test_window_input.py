@@ -33,7 +33,7 @@ def apart(prediction: PriorPrediction, silent: tuple[int, ...] = ()) -> PriorPre
 
 def test_a_frame_of_its_own_has_another_number_and_no_pose_in_the_world():
     found = taken(apart)
-    assert [one.structure for one in found] == [0] * CUT + [1] * (NUM_FRAMES - CUT)
+    assert [one.world for one in found] == [0] * CUT + [1] * (NUM_FRAMES - CUT)
     for one in found[CUT:]:
         assert (
             np.isnan(one.prediction.T_world_views.wxyz_xyz).all()
@@ -57,7 +57,7 @@ def test_the_raw_path_goes_on_from_the_last_known_pose_with_the_motion_that_is_k
 @pytest.mark.parametrize(("silent", "expected"), [((3,), [0, 0, 0, 0, 1, 1]), ((4,), [0, 0, 0, 0, 0, 1])])
 def test_an_answer_without_a_pose_says_nothing_of_the_frame(silent, expected):
     found = taken(lambda prediction: apart(prediction, silent))
-    assert [one.structure for one in found] == expected
+    assert [one.world for one in found] == expected
     here = silent[0]
     np.testing.assert_array_equal(found[here].raw[0].T_world_camera, found[here - 1].raw[0].T_world_camera)
     assert not found[here].raw[0].mask.any()
@@ -71,7 +71,7 @@ def test_a_frame_that_is_lost_for_a_while_is_the_same():
         poses[[view == 3 for view in prediction.window.views]] = np.nan
         return replace(prediction, T_anchor_view=poses)
 
-    assert {one.structure for one in taken(edit)} == {0}
+    assert {one.world for one in taken(edit)} == {0}
 
 
 def in_unit(prediction: PriorPrediction, metres: float) -> PriorPrediction:

@@ -92,6 +92,10 @@ def test_an_empty_cluster_stays_where_it_was_and_becomes_invalid():
     np.testing.assert_array_equal(counts, [30, 0])
     np.testing.assert_array_equal(centroids[1], [50, 50, 50])
     np.testing.assert_allclose(centroids[0], points.mean(0), atol=1e-6)  # one mean of 30 points
+    # Nor does it attract anything any more: it is nearer to the first point than the mean of both.
+    centroids, exists, _ = clustered([[0.0, 0, 0], [4, 0, 0]], [1, 1], [[1.0, 0, 0], [-1.5, 0, 0]])
+    np.testing.assert_array_equal(exists, [True, False])
+    np.testing.assert_array_equal(centroids[:, 0], [2, -1.5])
 
 
 def test_a_seed_that_does_not_exist_and_invalid_points_attract_nothing():

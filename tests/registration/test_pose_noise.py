@@ -180,7 +180,7 @@ def test_without_repeats_the_depths_say_it_and_one_guess_counts_like_one_repeat(
 
 def test_along_the_axes_lengths_are_in_mean_depths_and_what_is_informed_of_is_surer():
     """Of the motion and of the pose itself: three lengths, then three angles; nine depths are worth a third of one."""
-    latest, shared = np.float32([[0.1**2, 0.2**2], [0.3**2, 0.4**2]]), np.float32(0.5)
+    latest, shared = np.float32([[0.1**2, 0.0], [0.3**2, 0.4**2]]), np.float32(0.5)
     lengths, angles = pose_std(no_repeats(), latest, np.float32(0.01), shared).T
     given = np.float32(0.03), np.float32(DEPTH), np.float32(9.0), shared
     expected = np.stack([DEPTH * lengths] * 3 + [angles] * 3, axis=1)

@@ -61,9 +61,12 @@ def test_the_deviation_is_that_of_the_scales_where_regions_err_alike():
 
 
 def test_without_a_pair_the_other_scale_stands():
-    blind = replace(moved_points(T, NOW), valid=np.zeros(NUM_PIXELS, bool))
-    scale, std = on_host(repeat_scale)(NOW, blind, T, np.float32(0.8), RATIO)
-    assert scale == pytest.approx(0.8) and np.isfinite(std)
+    """A depth of 1e-30 m is none: the scale by which it would be one of the map overflows."""
+    before = moved_points(T, NOW)
+    blind = replace(before, valid=np.zeros(NUM_PIXELS, bool))
+    for now, seen in ((NOW, blind), (replace(NOW, points=1e-30 * np.asarray(NOW.points)), before)):
+        scale, std = on_host(repeat_scale)(now, seen, T, np.float32(0.8), RATIO)
+        assert scale == pytest.approx(0.8) and np.isfinite(std)
 
 
 @pytest.mark.parametrize("poison", [0.0, np.nan, 1e30])
@@ -87,7 +90,9 @@ def test_what_two_equal_predictions_differ_by_has_finite_slopes():
     assert np.isfinite(on_host(jax.grad(total))(before.points)).all()
 
 
-@pytest.mark.parametrize(("factor", "expected"), [(1.0, float(np.sort(np.asarray(NOW.points)[:, 2])[639])), (0.0, 1.0)])
+@pytest.mark.parametrize(
+    ("factor", "expected"), [(1.0, float(np.sort(np.asarray(NOW.points)[:, 2])[639])), (0.0, 1.0), (1e-30, 1.0)]
+)
 def test_the_mean_depth_is_the_median_of_the_points_before_the_camera(factor, expected):
     """Where all points were at the camera, depths were a part of 0 and the whole state NaN."""
     depths = factor * np.asarray(NOW.points)

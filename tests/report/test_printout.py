@@ -36,13 +36,13 @@ def test_many_in_a_row_are_named_however_long_the_sequence_is():
 def test_the_line_that_ends_a_run_says_how_many_frames_are_not_in_the_map_and_from_which_on():
     metrics = {f"frames/{key}": 0 for key in ("degraded", "lost")} | {"frames/tracked": 137, "frames/skipped": 2}
     metrics |= {"frames/initialization": 1, "frames/longest_untracked": 0, "frames/longest_untracked_from": None}
-    metrics["segments/unjoined_frames"] = 0
+    metrics["submaps/unjoined_frames"] = 0
     assert last_words(metrics) == ""
     metrics |= {"frames/degraded": 258, "frames/lost": 2, "frames/longest_untracked": 250}
     metrics |= {"frames/longest_untracked_from": 138}
     said = "260 of 400 frames are degraded or lost, 250 in a row from frame 138 on"
     assert last_words(metrics) == f"{said}; "
-    metrics["segments/unjoined_frames"] = 40
+    metrics["submaps/unjoined_frames"] = 40
     assert last_words(metrics) == f"{said}, 40 are in submaps that were never joined with the map; "
 
 

@@ -47,7 +47,7 @@ KEYS = {
     *(f"{whose}segmentation/{name}" for whose in ("", "raw_prior/") for name in SEGMENTATION),
     *(f"reconstruction_{kind}/{name}" for kind in ("se3", "centers") for name in RECONSTRUCTION),
     *(f"frames/{name}" for name in ("tracked", "degraded", "lost", "apart", "initialization", "skipped", "overflow")),
-    *("frames/longest_untracked", "frames/longest_untracked_from", "segments/unjoined_frames"),
+    *("frames/longest_untracked", "frames/longest_untracked_from", "submaps/unjoined_frames"),
     *(f"time/{name}_seconds" for name in PHASES),
     *(f"map/{name}" for name in ("num_gaussians", "double_wall_percent", "num_tentative", "capacity")),
     *("time/seconds_per_frame", "memory/peak_mb", "provenance"),

@@ -39,7 +39,7 @@ BY_HAND = (  # file of emgs_jax, text that occurs once in it, what stands there 
         "the errors stay in the axes of the camera before",
     ),
     (
-        "mapping/integrate",
+        "mapping/tracking",
         "seen_from(there.covariance, there.pose, pose[None])[0]",
         "there.covariance",
         "the map's error stays in the axes of the camera that made it",
