@@ -3,6 +3,8 @@
 from functools import cache
 
 import hydra
+import jax.numpy as jnp
+import jaxlie
 import numpy as np
 from scene import compose
 
@@ -12,6 +14,7 @@ from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.depth import DepthConfig
 from emgs_jax.prior.multiview.planar import PlanarConfig
+from emgs_jax.prior.sources import Sources
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.reconstruct import Shots
 
@@ -72,6 +75,16 @@ def matrix(rotation=(0.0, 0.0, 0.0), translation=(0.0, 0.0, 0.0)) -> np.ndarray:
     return T
 
 
+AROUND = [matrix(translation=t) for t in ((0.2, 0, 0), (-0.2, 0, 0), (0, 0.2, 0), (0, -0.2, 0))]
+
+
+def sources(views, poses=AROUND, is_used=None) -> Sources:
+    """What cameras with these poses show, beside a view at the origin; without `is_used` all count."""
+    T = jaxlie.SE3.from_matrix(jnp.asarray(np.linalg.inv(np.stack(poses)), jnp.float32))
+    shown = None if views is None else jnp.asarray(np.stack(views))
+    return Sources(shown, T, jnp.asarray([True] * len(poses) if is_used is None else is_used))
+
+
 def calibration() -> np.ndarray:
     return np.array([[FOCAL[0], 0, CENTER[0]], [0, FOCAL[1], CENTER[1]], [0, 0, 1]])
 
@@ -96,6 +109,11 @@ def plane_image(
         gray += 0.05 * np.cos(2 * np.pi * along / wave + phase)
     gray[(np.abs(points[..., :2]) < blank).all(axis=-1)] = 0.5
     return np.float32(np.clip(gray, 0, 1)), np.float32(depth)
+
+
+def painted(slope: float = 0.0, **options) -> tuple[np.ndarray, np.ndarray, list[np.ndarray]]:
+    """Image and depth of the plane as seen from the origin, and its images from `AROUND`."""
+    return *plane_image(np.eye(4), slope, **options), [plane_image(T, slope, **options)[0] for T in AROUND]
 
 
 def similarity_error(estimate: np.ndarray, truth: np.ndarray) -> float:

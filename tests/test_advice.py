@@ -494,7 +494,7 @@ OF_PREDICTIONS = [
     ({"folder": "{root}/nowhere"}, "does not exist: give the folder of predictions", {"folder": "{root}/own"}),
     (own(T_world_camera=None), "npz lacks T_world_camera; it has depth", own(), named_poses()),
     (own(depth=None), "must have depth or points, one of them"),
-    (own(depth=lambda frame: frame.depth.ravel()), r"depth must be \(h, w\)"),
+    (own(depth=lambda frame: frame.depth.ravel()), r"depth must be depths \(h, w\)"),
     (own(depth=lambda frame: frame.depth[:, :48]), "the whole image with 0 where nothing is known", own(depth=unseen)),
     (in_unit(1000, 1000), "depth in metres: write metres, .* or prior.scale=arbitrary", own(), {"scale": "arbitrary"}),
     (
@@ -519,7 +519,7 @@ OF_PREDICTIONS = [
     ),
     (
         own(confidence=lambda frame: np.full(frame.depth.shape, np.inf)),
-        "is inf: give finite numbers",
+        "must be finite and at least 1 where there is a depth, and is inf",
         own(confidence=lambda frame: np.full(frame.depth.shape, 9.0)),
     ),
     (own(confidence=lambda frame: np.ones((4, 5))), r"confidence must be numbers \(48, 64\), as what it is of"),
@@ -834,7 +834,7 @@ def read_network(root: Path, folder: str | None = "weights", **keys) -> bool:
     words = [f"prior.{key}={value}" for key, value in ({"resolution": "[56,42]"} | keys).items()]
     data = Sphere(size=(40, 30))
     with clear():
-        prior = build(compose("prior=mapanything", *words), "prior", load=lambda _: network_of(Double(data)))
+        prior = build(compose("prior=mapanything", *words), "prior", load=lambda *_: network_of(Double(data)))
     return prior.provenance.name == "mapanything"
 
 
@@ -854,7 +854,7 @@ OF_NETWORKS = [
     ({"resolution": "[518]"}, "must be .width, height. in multiples of 14", {"resolution": "[518,392]"}),
     ({"anchor_pose": "maybe"}, r"must be (on) or (off)", {"anchor_pose": "'{1}'"}, {"anchor_pose": "'{2}'"}),
     ({"anchor_depth_m": 0}, "must be above 0 m", {"anchor_depth_m": 2}),
-    ({"compute.amp": "fp8"}, "must be bf16, fp16 or (float32)", {"compute.amp": "{1}"}),
+    ({"compute.amp": "fp8"}, "must be one of bf16, fp16, (float32)", {"compute.amp": "{1}"}),
     (
         {"model": "vggt", "checkpoint": "weights"},
         r"is for prior.model=(\w+)",

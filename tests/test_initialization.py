@@ -40,9 +40,10 @@ def test_the_views_are_moved_to_the_world_by_the_priors_poses(result, views):
         np.testing.assert_allclose(result[2].points[i], expected.points, atol=1e-6)  # roundings
 
 
-def test_a_view_without_a_pose_has_no_point_and_the_others_make_the_map(views, camera, config):
+@pytest.mark.parametrize("nowhere", [np.nan, 0.0])
+def test_a_view_without_a_pose_has_no_point_and_the_others_make_the_map(views, camera, config, nowhere):
     poses = np.array(sc.stack_poses(POSES).wxyz_xyz)
-    poses[1] = np.nan
+    poses[1] = nowhere
     gaussians, weight, world = first_map(views, jaxlie.SE3(sc.device(poses)), camera, 1, config().fit)
     assert world.valid.any(axis=1).tolist() == [True, False, True]
     assert np.isfinite(gaussians.means).all()

@@ -72,6 +72,12 @@ CASES = {
         {"masks": [NOTHING] * 4 + [BLOCK] * 8},
         BLOCK,
     ),
+    "and was seen through twice only": (
+        [WALL] * 2 + [HERE] * 8,
+        HERE,
+        {"masks": [NOTHING] * 2 + [BLOCK] * 8},
+        BLOCK,
+    ),
     "and has stood for all looks": ([HERE] * NUM_LOOKS, HERE, {"masks": [BLOCK] * NUM_LOOKS}, NOTHING),
     "one that is gone": ([HERE] * 5, WALL, {}, NOTHING),
     "a wrong prediction: a line": ([WALL] * 5, with_block(where=COLUMNS == 30), {}, NOTHING),
@@ -85,6 +91,12 @@ CASES = {
     "one look only": ([WALL], HERE, {}, NOTHING),
     "no look": ([], HERE, {}, NOTHING),
     "what fills the view": ([WALL] * 5, np.full((48, 64), 1.0), {}, ~NOTHING),
+    "what is beside all looks, whose corner is far": (
+        [np.where(ROWS + COLUMNS < 9, 10.0, WALL)] * 5,
+        WALL,
+        {"T_previous_camera": pose([0.0, 1.5, 0.0])},
+        NOTHING,
+    ),
     "a place that no look shows": ([np.where(BLOCK, 0.0, WALL)] * 5, HERE, {}, NOTHING),
 }
 
@@ -128,6 +140,9 @@ def test_a_camera_that_turns_and_a_map_that_moves_change_nothing_and_an_untracke
     lost = replace(seen(HERE), valid=device(np.zeros(48 * 64, bool)))
     skipped = looked(looks, lost, device(NOTHING.reshape(-1)), poses[3], pose(), CAMERA)
     np.testing.assert_array_equal(skipped.depth, looks.depth)
+    right = replace(seen(HERE), valid=device((COLUMNS > 9).reshape(-1)))
+    depth = looked(looks, right, device(NOTHING.reshape(-1)), pose(), pose(), CAMERA).depth
+    assert np.isfinite(depth).all() and not depth[0][:, (COLUMNS <= 9).ravel()].any()
     np.testing.assert_allclose(skipped.T_previous_look.wxyz_xyz[0], poses[3].inverse().wxyz_xyz, atol=1e-6)
 
 

@@ -28,9 +28,8 @@ from emgs_jax.config.values import check_values
 from emgs_jax.data.masks import Masks
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
-from emgs_jax.prior.featured import Featured, Requeried
-from emgs_jax.prior.files.truth import check_truth
-from emgs_jax.prior.masked import Masked
+from emgs_jax.prior.files.conventions import check_truth
+from emgs_jax.prior.wrapped import Featured, Masked, Requeried
 
 if TYPE_CHECKING:
     from emgs_jax.back_end.state import BackEndConfig

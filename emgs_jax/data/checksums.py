@@ -90,13 +90,16 @@ def read_sums(path: Path) -> dict[Path, tuple[int, str]]:
     for number, line in enumerate(lines, 1):
         if not line.strip():
             continue
-        parts = re.fullmatch(r"([0-9a-fA-F]{64}) [ *](.+)", line)
+        parts = re.fullmatch(r"(\\?)([0-9a-fA-F]{64}) [ *](.+)", line)
         if parts is None or "\0" in line:
             raise ValueError(
                 f"{path}, line {number}: expected 64 hexadecimal digits, two spaces and a name, got {line[:80]!r}; "
                 f"write the list again {WRITE}"
             )
-        found[_place(path.parent / parts[2])] = number, parts[1].lower()
+        escapes, digest, name = parts.groups()
+        if escapes:  # as the names of files unpacked from Windows' archives may have backslashes
+            name = re.sub(r"\\(.)", lambda sign: {"n": "\n", "r": "\r"}.get(sign[1], sign[1]), name)
+        found[_place(path.parent / name)] = number, digest.lower()
     return found
 
 

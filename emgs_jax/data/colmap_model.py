@@ -115,14 +115,14 @@ def _text_cameras(path: Path) -> dict[int, Calibration]:
 
 
 def _binary_images(path: Path) -> list[Image]:
-    """Images in order of their numbers; the layout is in COLMAP's documentation of its output format."""
-    found = {}
+    """The layout is in COLMAP's documentation of its output format."""
+    images = []
     for record in _Records(path):
         number, *values, camera = record.values("I7dI")
         name = record.text()
         record.skip(POINT_SIZE * record.values("Q")[0])
-        found[number] = name, camera, _pose(values, f"{path}, image {number}")
-    return [found[number] for number in sorted(found)]
+        images.append((name, camera, _pose(values, f"{path}, image {number}")))
+    return images
 
 
 def _text_images(path: Path) -> list[Image]:

@@ -31,14 +31,11 @@ def find_image(folder: Path, name: str) -> Path:
 
     Where none of them is there it is the file of that name, which then cannot be read.
     """
-    written = folder / name
-    for path in dict.fromkeys((written, folder / name.replace("\\", "/"))):
-        if is_file(path):
-            return path
-        for suffix in IMAGE_SUFFIXES:
-            for ended in (path.with_name(path.name + suffix), path.with_name(path.name + suffix.upper())):
-                if is_file(ended):
-                    return ended
+    endings = "", *IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES)
+    for written in dict.fromkeys((name, name.replace("\\", "/"))):
+        for ending in endings:
+            if is_file(path := folder / f"{written}{ending}"):
+                return path
     return folder / name.replace("\\", "/")
 
 

@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import InitVar, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -99,19 +99,19 @@ class Tum(TumLayout):
     distortion: Sequence[Number] | None = None
     # folder in the sequence with the true classes of every image, see `LabelFolder`; None = there are none
     labels: str | None = None
-    classes: InitVar[str] = "classes.txt"  # file in the sequence that names them
+    classes: str = "classes.txt"  # file in the sequence that names them, in whose place then the names are
     unknown: Sequence[int] | None = None  # their ids that mean no class, see `LabelFolder`
 
     name = "tum"
     source = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
     calibrations = CALIBRATIONS
 
-    def __post_init__(self, classes: str) -> None:
+    def __post_init__(self) -> None:
         super().__post_init__()
         self._labels = None
         if self.labels is not None:
             ids = as_unknown(self.unknown, "dataset.unknown")
-            self._labels = LabelFolder(self._folder / self.labels, self._folder / classes, ids, "dataset.unknown")
+            self._labels = LabelFolder(self._folder / self.labels, self._folder / self.classes, ids, "dataset.unknown")
         self.classes = () if self._labels is None else self._labels.names
 
     def _labels_of(self, index: int) -> Int32[np.ndarray, "h w"] | None:

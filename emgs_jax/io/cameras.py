@@ -54,12 +54,7 @@ def _words(values: Sequence[float]) -> str:
 
 
 def save_transforms(
-    path: Path,
-    camera: Camera,
-    names: Sequence[str],
-    T_world_camera: Any,
-    points_file: str,
-    masks: Sequence[str] = (),
+    path: Path, camera: Camera, names: Sequence[str], T_world_camera: Any, points_file: str, masks: Sequence[str] = ()
 ) -> None:
     """Write transforms.json of one pinhole camera.
 

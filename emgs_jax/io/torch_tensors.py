@@ -21,6 +21,8 @@ DTYPES = {"torch FloatStorage": "<f4", "torch LongStorage": "<i8"}
 DAMAGED = (LookupError, TypeError, AttributeError, UnicodeDecodeError, RuntimeError, OverflowError)
 DAMAGED += (BadZipFile, EOFError, zlib.error)
 _MARK = object()
+_LITERALS = {"MARK": lambda: _MARK, "NONE": lambda: None, "NEWTRUE": lambda: True, "NEWFALSE": lambda: False}
+_LITERALS |= {"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple}
 
 
 class _Tensor(NamedTuple):
@@ -104,20 +106,16 @@ def _value(stream: BytesIO) -> Any:
 
     for code, argument, _ in pickletools.genops(stream):
         match code.name:
-            case "PROTO" | "STOP":
+            case "PROTO" | "STOP" | "BINPERSID":  # the last makes a storage of the tuple that describes it
                 pass
-            case "MARK":
-                stack.append(_MARK)
             case "BINPUT" | "LONG_BINPUT":
                 memo[argument] = stack[-1]
             case "BINGET" | "LONG_BINGET":
                 stack.append(memo[argument])
             case "BINUNICODE" | "BININT" | "BININT1" | "BININT2" | "LONG1" | "BINFLOAT" | "GLOBAL":
                 stack.append(argument)
-            case "NONE" | "NEWTRUE" | "NEWFALSE":
-                stack.append({"NONE": None, "NEWTRUE": True, "NEWFALSE": False}[code.name])
-            case "EMPTY_DICT" | "EMPTY_LIST" | "EMPTY_TUPLE":
-                stack.append({"EMPTY_DICT": dict, "EMPTY_LIST": list, "EMPTY_TUPLE": tuple}[code.name]())
+            case name if name in _LITERALS:
+                stack.append(_LITERALS[name]())
             case "TUPLE":
                 stack.append(tuple(since_mark()))
             case "TUPLE1" | "TUPLE2" | "TUPLE3":
@@ -129,8 +127,6 @@ def _value(stream: BytesIO) -> Any:
             case "APPENDS" | "APPEND":
                 items = since_mark() if code.name == "APPENDS" else [stack.pop()]
                 stack[-1].extend(items)
-            case "BINPERSID":
-                pass  # a storage: the tuple that describes it
             case "BUILD":
                 stack.pop()  # versions of layers, beside the dictionary of their tensors
             case "REDUCE":

@@ -176,6 +176,31 @@ def with_frames(calls: Iterable[Window], dataset: Dataset) -> Iterator[tuple[Win
         yield window, frames
 
 
+def check_order(window: Window, frames: Sequence[Frame]) -> None:
+    """Raise ValueError where `frames` are not those of `window.views`."""
+    indices = tuple(frame.index for frame in frames)
+    if indices != window.views:
+        raise ValueError(f"frames must be those of window.views {window.views} in that order, got {indices}")
+
+
+DenseView = tuple[np.ndarray, np.ndarray, np.ndarray]  # points (h, w, 3), confidence and mask (h, w)
+
+
+def no_points(size: Sequence[int]) -> DenseView:
+    """A view of (width, height) of which nothing is known."""
+    shape = size[1], size[0]
+    return np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, bool)
+
+
+def predicted(
+    window: Window, T_anchor_view: np.ndarray, dense: Sequence[DenseView], features: np.ndarray | None = None, **known
+) -> PriorPrediction:
+    """The answer with these dense views, and without features if there are none."""
+    points, confidence, mask = (np.stack(parts) for parts in zip(*dense, strict=True))
+    features = np.zeros((*mask.shape, 0), np.float16) if features is None else features
+    return PriorPrediction(window, T_anchor_view, points, confidence, mask, features, **known)
+
+
 def equal_covariances(pose_std: Sequence[float] | None, T_anchor_view: np.ndarray) -> np.ndarray | None:
     """Covariances of poses of which each errs by `pose_std`, a length and degrees, along every axis; None for none."""
     if pose_std is None:
@@ -190,9 +215,8 @@ def check_pose_std(pose_std: Sequence[float] | None) -> tuple[float, float] | No
     """The key `prior.pose_std` as numbers; ValueError where it is no length and angle."""
     if pose_std is None:
         return None
-    values = [*pose_std] if isinstance(pose_std, Sequence) and not isinstance(pose_std, str) else [pose_std]
     try:
-        length, degrees = (float(value) for value in values)
+        length, degrees = map(float, pose_std)
     except (TypeError, ValueError):
         length = degrees = np.nan
     if not (0 <= length < np.inf and 0 <= degrees <= 180):

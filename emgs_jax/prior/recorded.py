@@ -21,13 +21,15 @@ run leaves a valid folder, which `record` completes.
 import hashlib
 import io
 import json
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.data.reading import is_rigid
 from emgs_jax.io.files import remove_temporaries, write_file
 from emgs_jax.io.npz import read_npz
 from emgs_jax.prior.base import (
@@ -41,19 +43,72 @@ from emgs_jax.prior.base import (
     windows,
     with_frames,
 )
-from emgs_jax.prior.recorded_checks import (
-    COMPLETE,
-    FIELDS,
-    OPTIONAL,
-    REMEDY,
-    check_arrays,
-    check_manifest,
-    check_numbers,
-    check_text,
-)
 
-FORMAT, VERSION = "emgs_jax.predictions", 3
-READABLE = (1, 2, 3)
+FORMAT, VERSION, READABLE = "emgs_jax.predictions", 3, (1, 2, 3)
+WINDOW = ("inference", "views", "dense", "current")
+COMPLETE = "`python -m experiments.predict`, called as for the others, makes what is missing or damaged"
+REMEDY = "record into another folder with `python -m experiments.predict`"
+FIELDS = {  # array -> dtype and the axes that it has; d, v, h, w, i, j, c, k, l have one length each, y, x, f are free
+    "T_anchor_view": (np.float64, "vij"),
+    "points": (np.float32, "dhwc"),
+    "confidence": (np.float32, "dhw"),
+    "mask": (np.bool_, "dhw"),
+    "features": (np.float16, "dyxf"),
+}
+OPTIONAL = {"pose_covariance": (np.float64, "vkl"), "scale_std": (np.float64, ""), "world": (np.int64, "")}
+MAX_LENGTH = 1e6  # of positions, in the prior's unit: more is no room
+MANIFEST = {
+    "dataset": {"name": str, "sequence": str, "num_frames": int, "size": list, "intrinsics": list, "fingerprint": str},
+    "window_size": int,
+    "provenance": {"name": str, "settings": dict, "is_simulated": bool},
+    "feature_names": list,
+    "num_inferences": int,
+    "complete": bool,
+    "files": dict,
+}
+
+
+def check_manifest(path: object, manifest: Mapping[str, Any], expected: Mapping[str, Any] = MANIFEST) -> None:
+    """Raise ValueError where a manifest lacks a key, one has another type, or a block has another key."""
+    for key, kind in expected.items():
+        kind, block = (dict, kind) if isinstance(kind, dict) else (kind, None)
+        if type(manifest.get(key)) is not kind or (block and manifest[key].keys() - block.keys()):
+            what = f" with {', '.join(block)}" if block else ""
+            raise ValueError(f"{path} is no manifest: {key} must be there as {kind.__name__}{what}: {REMEDY}")
+        if block:
+            check_manifest(path, manifest[key], block)
+
+
+def check_arrays(path: object, arrays: Mapping[str, np.ndarray], sizes: Mapping[str, int]) -> None:
+    """Raise ValueError where an array has not the dtype and shape of the format."""
+    sizes = {**sizes, "i": 4, "j": 4, "c": 3, "k": 6, "l": 6}
+    for key, (dtype, axes) in (FIELDS | {key: OPTIONAL[key] for key in OPTIONAL if key in arrays}).items():
+        got = arrays[key]
+        expected = tuple(sizes.get(axis, got.shape[k] if k < got.ndim else 0) for k, axis in enumerate(axes))
+        if got.dtype != dtype or got.shape != expected:
+            raise ValueError(
+                f"{path}: {key} must be {np.dtype(dtype)} {expected}, got {got.dtype} {got.shape}: {REMEDY}"
+            )
+
+
+def check_numbers(path: object, arrays: Mapping[str, np.ndarray]) -> None:
+    """Raise ValueError where numbers that the mask lets through, or the poses, mean nothing.
+
+    A pose that is not finite is allowed: there the prior has none.
+    """
+    points, confident = arrays["points"][arrays["mask"]], arrays["confidence"][arrays["mask"]]
+    poses = arrays["T_anchor_view"]
+    poses = poses[np.isfinite(poses).all((1, 2))]
+    means_something = {
+        f"points under the mask are not finite, or farther than {MAX_LENGTH:g}": np.abs(points) <= MAX_LENGTH,
+        "a confidence under the mask is negative or not finite": (confident >= 0) & np.isfinite(confident),
+        "features are not finite": np.isfinite(arrays["features"]),
+        "a pose is no rigid motion": is_rigid(poses),
+        f"a pose is farther than {MAX_LENGTH:g}": np.abs(poses[:, :3, 3]) <= MAX_LENGTH,
+    }
+    for what, is_sound in means_something.items():
+        if not np.all(is_sound):
+            raise ValueError(f"{path}: {what}: the recording is forged or its prior has a fault; {REMEDY}")
 
 
 def record(
@@ -69,18 +124,28 @@ def record(
     """
     folder = Path(folder)
     calls = list(windows(len(dataset), window_size, prior.num_newer(window_size)))
-    header = _header(prior, dataset, window_size, len(calls))
+    header = {
+        "format": FORMAT,
+        "version": VERSION,
+        "dataset": _described(dataset),
+        "window_size": window_size,
+        "provenance": asdict(prior.provenance),
+        "feature_names": list(prior.feature_names),
+        "num_inferences": len(calls),
+        "complete": False,
+    }
+    header = json.loads(json.dumps(header))  # as it is read
     files = _resume(folder, header)
     folder.mkdir(parents=True, exist_ok=True)
     remove_temporaries(folder)
-    files["text_features.npz"] = _write(folder / "text_features.npz", _npz({"text_features": prior.text_features}))
+    files["text_features.npz"] = _write_npz(folder / "text_features.npz", {"text_features": prior.text_features})
     names = [f"{window.inference:06d}.npz" for window in calls]
     missing = {row for row, name in enumerate(names) if _digest_of(folder / name) != files.get(name, "")}
     for window, frames in with_frames((call for call in progress(calls) if call.inference in missing), dataset):
         prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)
         check_unit(prediction)
         name = names[window.inference]
-        files[name] = _write(folder / name, _npz(_arrays(prediction)))
+        files[name] = _write_npz(folder / name, _arrays(prediction))
         _write_manifest(folder, header, files)
     _write_manifest(folder, header | {"complete": True}, files)
 
@@ -94,7 +159,7 @@ def add_visits(folder: Path, prediction: PriorPrediction) -> None:
     """Write a prior's prediction of two visits into a recording that is complete."""
     manifest, name = _read_manifest(folder), visits_file(prediction.window)
     files = manifest.pop("files")
-    files[name] = _write(folder / name, _npz(_arrays(prediction)))
+    files[name] = _write_npz(folder / name, _arrays(prediction))
     _write_manifest(folder, manifest, files)
 
 
@@ -119,7 +184,13 @@ class Recorded(Prior):
             self.provenance = replace(self.provenance, settings=settings)
         self.feature_names = tuple(self._manifest["feature_names"])
         self.text_features = self._load("text_features.npz", ("text_features",))["text_features"]
-        check_text(self.folder / "text_features.npz", self.text_features, self.feature_names)
+        text = self.text_features
+        fits = text.ndim == 2 and len(text) == len(self.feature_names) and text.dtype.kind == "f"
+        if not fits or not np.isfinite(text).all():
+            raise ValueError(
+                f"{self.folder / 'text_features.npz'} must hold a finite vector for each of {len(self.feature_names)} "
+                f"names, got {text.shape}: {REMEDY}"
+            )
 
     def num_newer(self, window_size: int) -> int:
         """Those that the prior asked for: in the first window they come after the dense ones but for the newest."""
@@ -160,10 +231,11 @@ class Recorded(Prior):
                 f"{self.folder} was recorded at size {size} with intrinsics {data['intrinsics']}; asked for are "
                 f"{len(frames)} frames of {shape[::-1]} with {[*intrinsics]} as {len(window.views)} views: {REMEDY}"
             )
-        arrays = self._load(name, ("inference", "views", "dense", "current", *FIELDS), (*OPTIONAL,))
-        recorded = [arrays[key].tolist() for key in ("inference", "views", "dense", "current")]
-        if recorded != [window.inference, list(window.views), list(window.dense), window.current]:
-            raise ValueError(f"{self.folder / name} answers another window ({recorded[1]}) than {window}: {REMEDY}")
+        arrays = self._load(name, (*WINDOW, *FIELDS), (*OPTIONAL,))
+        if not all(np.array_equal(arrays[key], getattr(window, key)) for key in WINDOW):
+            raise ValueError(
+                f"{self.folder / name} answers another window ({arrays['views'].tolist()}) than {window}: {REMEDY}"
+            )
         sizes = {"v": len(window.views), "d": len(window.dense), "h": shape[0], "w": shape[1]}
         check_arrays(self.folder / name, arrays, sizes)
         check_numbers(self.folder / name, arrays)
@@ -197,21 +269,6 @@ def _described(dataset: Dataset) -> dict:
         "intrinsics": [float(value) for value in dataset.intrinsics],
         "fingerprint": dataset.fingerprint(),
     }
-
-
-def _header(prior: Prior, dataset: Dataset, window_size: int, num_inferences: int) -> dict:
-    """Return the manifest without the files, as JSON gives it back."""
-    header = {
-        "format": FORMAT,
-        "version": VERSION,
-        "dataset": _described(dataset),
-        "window_size": window_size,
-        "provenance": asdict(prior.provenance),
-        "feature_names": list(prior.feature_names),
-        "num_inferences": num_inferences,
-        "complete": False,
-    }
-    return json.loads(json.dumps(header))
 
 
 def _resume(folder: Path, header: dict) -> dict[str, str]:
@@ -266,21 +323,15 @@ def _write(path: Path, content: bytes) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _npz(arrays: dict[str, np.ndarray]) -> bytes:
+def _write_npz(path: Path, arrays: dict[str, np.ndarray]) -> str:
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
-    return buffer.getvalue()
+    return _write(path, buffer.getvalue())
 
 
 def _arrays(prediction: PriorPrediction) -> dict[str, np.ndarray]:
     """Return the arrays of one inference's file; ValueError where a dtype is not the format's."""
-    window = prediction.window
-    arrays = {
-        "inference": np.asarray(window.inference),
-        "views": np.asarray(window.views),
-        "dense": np.asarray(window.dense),
-        "current": np.asarray(window.current),
-    }
+    arrays = {key: np.asarray(getattr(prediction.window, key)) for key in WINDOW}
     given = {key: OPTIONAL[key] for key in OPTIONAL if getattr(prediction, key) is not None}
     for key, (dtype, _) in (FIELDS | given).items():
         arrays[key] = np.asarray(getattr(prediction, key))

@@ -1,5 +1,6 @@
 """Windows of two visits of a place in a recording: which these are is found from images and recorded depths alone."""
 
+import contextlib
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
@@ -42,11 +43,10 @@ def places_seen_twice(
             query = make_keyframe(index, image, points, mask, dataset.intrinsics, appearance)
             database = add_keyframe(database, query, appearance)
             for candidate in propose_candidates(database, len(database.keyframes) - 1, appearance):
-                try:
-                    align(database.keyframes[candidate.row], query, alignment)
-                except RefusedError:
-                    continue
-                pairs.append((database.keyframes[candidate.row].frame, index))
+                earlier = database.keyframes[candidate]
+                with contextlib.suppress(RefusedError):
+                    align(earlier, query, alignment)
+                    pairs.append((earlier.frame, index))
     return pairs
 
 

@@ -7,6 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from written_benchmarks import write_euroc, write_kitti
 from written_scene import moved, write_images, write_replica, write_seven_scenes, write_tum
 
 SHARED = Path(__file__).resolve().parents[2].parent / "shared" / "data"
@@ -50,6 +51,7 @@ def copy_of(write):
 seven_scenes_root, tum_root, replica_root, images_root = map(
     copy_of, (write_seven_scenes, write_tum, write_replica, write_images)
 )
+euroc_root, kitti_root = map(copy_of, (write_euroc, write_kitti))
 bonn_root = tum_root  # the same layout
 
 

@@ -100,7 +100,7 @@ def test_only_images_must_be_listed_and_a_missing_file_is_called_missing(replica
         list(frames)
 
 
-@pytest.mark.parametrize("name", ["plain.jpg", "two  spaces.jpg", "ä.jpg", " x"])
+@pytest.mark.parametrize("name", ["plain.jpg", "two  spaces.jpg", "new\nline.jpg", "back\\slash.jpg", "ä.jpg", " x"])
 def test_names_are_read_as_sha256sum_writes_them(name, tmp_path):
     digest = hashlib.sha256(b"1").hexdigest()
     for option in ("--text", "--binary"):

@@ -1,18 +1,11 @@
 """EuRoC's folders; oracles: poses from which the files were written, the lens of dataset=images."""
 
 import numpy as np
-import pytest
 from written_scene import scene_pose
 
 from emgs_jax.data.euroc import Euroc
 from emgs_jax.data.images import Images
-from tests.data.written_benchmarks import LENS, START, write_euroc
-
-
-@pytest.fixture
-def euroc_root(tmp_path):
-    write_euroc(tmp_path)
-    return tmp_path
+from tests.data.written_benchmarks import LENS, START
 
 
 def load(root, **options):

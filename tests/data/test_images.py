@@ -121,7 +121,7 @@ def test_a_video_gives_the_right_frame_in_any_order(suffix, tmp_path):
     assert len(dataset) == 3
     for i in (0, 1, 2, 1, 0, 2, 2):
         frame = dataset[i]
-        assert number_of(frame) == 2 * i
+        assert number_of(frame) == 2 * i and frame.name == f"{path}, frame {2 * i}"
         assert frame.timestamp == pytest.approx(2 * i / 25)
 
 

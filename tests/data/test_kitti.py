@@ -5,14 +5,8 @@ import pytest
 from written_scene import scene_pose
 
 from emgs_jax.data.kitti import Kitti
-from tests.data.written_benchmarks import CENTER, write_kitti
+from tests.data.written_benchmarks import CENTER
 from tests.data.written_benchmarks import KITTI_SIZE as SIZE
-
-
-@pytest.fixture
-def kitti_root(tmp_path):
-    write_kitti(tmp_path)
-    return tmp_path
 
 
 def load(root, sequence="07", **options):

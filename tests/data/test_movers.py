@@ -56,6 +56,8 @@ def test_people_cover_a_share_of_the_image_and_each_frame_depends_on_its_place_o
     part = scene(name, movers, start=4, stop=20, stride=5)
     np.testing.assert_array_equal(part[1].image, whole[9].image)
     assert len({scene(name, count).fingerprint() for count in range(4)}) == 4
+    # of version 1, with which predictions were recorded
+    np.testing.assert_allclose(whole._movers[0].poses[7, :2, 3], [-0.26804518, 0.88632802], atol=1e-8)
 
 
 def test_a_person_walks_a_chair_is_moved_once_and_a_door_opens():

@@ -135,12 +135,9 @@ class Double:
         T[:3, 3] *= unit
         output = {
             "pts3d_cam": points[None].astype(np.float32),
-            "pts3d": (points @ T[:3, :3].T + T[:3, 3])[None].astype(np.float32),
             "depth_z": depth[None, ..., None].astype(np.float32),
             "intrinsics": intrinsics[None].astype(np.float32),
             "camera_poses": T[None].astype(np.float32),
-            "cam_trans": T[None, :3, 3].astype(np.float32),
-            "cam_quats": Rotation.from_matrix(T[:3, :3]).as_quat()[None].astype(np.float32),
             "conf": (1 + u + v)[None].astype(np.float32),
             "non_ambiguous_mask": np.ones((1, *depth.shape), bool),
         }

@@ -5,11 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from emgs_jax.prior.network.framework import ComputeConfig, NetworkSettings
+from emgs_jax.prior.network.framework import ComputeConfig
+from emgs_jax.prior.network.torch_network import load_network
 
 
-def settings(model="mapanything", checkpoint=None, device="cpu", amp="bf16"):
-    return NetworkSettings(model, checkpoint, ComputeConfig(device, amp, True, 1))
+def load(model="mapanything", checkpoint=None, device="cpu", amp="bf16"):
+    return load_network(model, checkpoint, ComputeConfig(device, amp, True, 1))
 
 
 def write_checkpoint(folder: Path, encoder: dict) -> Path:

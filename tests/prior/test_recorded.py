@@ -138,13 +138,6 @@ def test_an_interrupted_recording_says_so_and_is_completed_without_repeating_wor
     assert prior.num_calls == 5 and (folder / "000001.npz").read_bytes() == whole
 
 
-def test_a_recording_of_another_prior_is_refused_and_left_as_it_is(folder, room):
-    before = contents(folder)
-    with pytest.raises(ValueError, match="choose another folder"):
-        record(Simulated(seed=6, feature_size=4, classes=room.classes), room, WINDOW_SIZE, folder)
-    assert contents(folder) == before
-
-
 def test_arrays_of_another_precision_or_shape_are_refused_even_with_fitting_hashes(tmp_path, room):
     class Other(Simulated):
         change = {}
@@ -163,25 +156,21 @@ def test_arrays_of_another_precision_or_shape_are_refused_even_with_fitting_hash
         Recorded(tmp_path / "narrow").predict(window, frames, room.intrinsics)
 
 
-def test_another_sequence_window_size_window_or_calibration_is_refused_by_name(folder, room, make_room):
+def test_another_sequence_window_or_calibration_is_refused_by_name(folder, room, make_room):
     replay, (window, frames) = Recorded(folder), calls(room)[1]
     small = [make_room(size=(20, 30))[i] for i in window.views]
     for message, *question in (
         ("another window", replace(window, dense=(0, 1)), frames, room.intrinsics),
         ("intrinsics", window, frames, (1.0, 2.0, 3.0, 4.0)),
         ("size", window, small, room.intrinsics),
-        ("000007.npz is missing", replace(window, inference=7), frames, room.intrinsics),
     ):
         with pytest.raises(ValueError, match=message):
             replay.predict(*question)
-    with pytest.raises(ValueError, match="window_size 3, but this run has 4"):
-        replay.check(room, 4)
     for name, value in (
         ("sequence", "two"),
         ("name", "tum"),
         ("size", (32, 24)),
         ("intrinsics", (50.0, 48.0, 19.25, 15.0)),
-        ("num_frames", 7),
         ("fingerprint", lambda: "other"),
     ):
         other = make_room()
@@ -200,24 +189,22 @@ def damaged(content, seed):
         yield content[:at] + rng.bytes(length) + content[at + length :]
 
 
-def test_damage_gives_a_value_error_with_the_remedy_or_the_same_content(folder, room):
-    """A flipped bit in the manifest's white space may leave the same content; anything else must be noticed."""
+def test_no_damage_to_an_inference_or_to_the_manifest_goes_unnoticed(folder, room):
+    """A flipped bit in the manifest's white space may leave the same content."""
     path, replay, (window, frames) = folder / "000001.npz", Recorded(folder), calls(room)[1]
     for version in damaged(path.read_bytes(), seed=1):
         path.write_bytes(version)
-        with pytest.raises(ValueError, match="000001.npz is damaged.*experiments.predict"):
+        with pytest.raises(ValueError, match="000001.npz is damaged"):
             replay.predict(window, frames, room.intrinsics)
     path, noticed = folder / "manifest.json", 0
     whole = path.read_bytes()
     for version in damaged(whole, seed=0):
         path.write_bytes(version)
         try:
-            Recorded(folder)
+            assert Recorded(folder) and json.loads(version) == json.loads(whole)
         except ValueError as error:
             assert str(path) in str(error)
             noticed += 1
-        else:
-            assert json.loads(version) == json.loads(whole)
     assert noticed > 50
 
 
@@ -228,8 +215,8 @@ def poisoned(array, value):
 
 
 FORGED = [
-    (with_array("points", lambda a: poisoned(a, np.nan)), "points under the mask are not finite"),
-    (with_array("points", lambda a: a * np.float32(1e7)), "points under the mask are farther than 1e"),
+    (with_array("points", lambda a: poisoned(a, np.nan)), "points under the mask are not finite, or farther"),
+    (with_array("points", lambda a: a * np.float32(1e7)), "points under the mask are not finite, or farther than 1e"),
     (with_array("confidence", lambda a: poisoned(a, np.nan)), "a confidence under the mask is negative or not finite"),
     (with_array("confidence", lambda a: -a), "a confidence under the mask is negative"),
     (with_array("features", lambda a: poisoned(a, np.nan)), "features are not finite"),
@@ -266,12 +253,11 @@ def test_a_pose_that_is_not_there_is_no_fault_and_forged_text_features_are_one(f
     ("edit", "message"),
     [
         (lambda m: m.pop("files"), "files must be there as dict"),
-        (lambda m: m.pop("complete"), "complete must be there as bool"),
         (lambda m: m.update(window_size="3"), "window_size must be there as int"),
-        (lambda m: m.update(dataset=None), "dataset must be there as dict"),
+        (lambda m: m.update(dataset=None), "dataset must be there as dict with name"),
         (lambda m: m["dataset"].pop("size"), "size must be there as list"),
         (lambda m: m["provenance"].pop("is_simulated"), "is_simulated must be there as bool"),
-        (lambda m: m["provenance"].update(more=1), "provenance has more"),
+        (lambda m: m["provenance"].update(more=1), "provenance must be there as dict with name, settings, is_sim"),
     ],
 )
 def test_a_manifest_that_lacks_a_key_is_refused_even_with_a_fitting_checksum(folder, edit, message):
@@ -312,11 +298,6 @@ def test_what_the_simulated_prior_says_again_is_another_draw_about_the_same_trut
     truth = np.linalg.inv(room[0].T_world_camera) @ room[4].T_world_camera
     exact = Simulated(level=0).revisit(window, frames, room.intrinsics).T_anchor_view[-1]
     np.testing.assert_allclose(exact, truth, atol=1e-9)
-
-
-def test_views_of_both_visits_are_of_the_past():
-    assert visits(5, 90, 3, 10).views == (5, 2, 8, 87, 90) and visits(5, 90, 3, 10).inference == 81
-    assert visits(1, 3, 3, 10).views == (1, 0, 3) and visits(1, 3, 3, 10).inference == 0
 
 
 def test_of_visits_of_which_the_prior_knows_nothing_nothing_is_recorded(folder, prior, room, monkeypatch):

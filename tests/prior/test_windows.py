@@ -2,15 +2,11 @@
 
 import pytest
 
-from emgs_jax.prior.base import Window, windows
+from emgs_jax.prior.base import Window, visits, windows
 
 
-def test_no_frames_give_no_window_and_one_frame_the_first_only():
-    assert list(windows(0, 4)) == [] and list(windows(1, 4)) == [Window(0, (0,), (0,), 0)]
-
-
-def test_twelve_frames_with_a_window_of_four():
-    assert list(windows(12, 4)) == [
+def test_no_frames_give_no_window_and_twelve_those_of_four():
+    assert list(windows(0, 4)) == [] and list(windows(12, 4)) == [
         Window(0, (0, 1, 2, 3), (0, 1, 2, 3), 3),
         Window(1, (0, 1, 2, 3, 4, 5), (3, 4), 4),
         Window(2, (0, 1, 2, 3, 4, 5, 6), (4, 5), 5),
@@ -56,3 +52,8 @@ def test_every_frame_is_integrated_once_in_order_and_no_view_is_listed_twice(num
     for size in (0, 2.5):
         with pytest.raises(ValueError, match=f"slam.window_size must be a whole number of images, .* got {size}"):
             list(windows(5, size))
+
+
+def test_views_of_two_visits_are_of_the_past():
+    assert visits(5, 90, 3, 10) == Window(81, (5, 2, 8, 87, 90), (5, 90), 90)
+    assert visits(1, 3, 3, 10) == Window(0, (1, 0, 3), (1, 3), 3)

@@ -144,14 +144,14 @@ def test_a_pose_that_is_given_keeps_its_weight_and_its_unit_and_has_little_of_th
 
 def test_a_frame_that_is_tracked_is_known_as_its_points_say_and_another_as_before():
     twice = jaxlie.SE3(device(np.tile(MOTION.wxyz_xyz, (2, 1))))
-    before = jax.device_get(eqx.tree_at(lambda b: b.repeats.predicted, known(), twice))
+    before = jax.device_get(eqx.tree_at(lambda b: b.repeats.predicted, replace(known(), log_scale=0.3), twice))
     arguments = before, found_with(1e4 * np.eye(7)), np.float32(0.02), np.float32(1.1)
     after, by_map = next_belief(*arguments, np.array(True), np.float32(5.0))
     # Twice the noise is four times P, and five frames whose points err alike say of the scale what one of them does.
     nothing, said = np.zeros(7, np.float32), np.float32(np.diag([1e4] * 6 + [2e3]))
     _, expected = update(4.0 * covariance(), nothing, said)
     np.testing.assert_allclose(after.covariance, expected, rtol=1e-5)
-    np.testing.assert_allclose(after.log_scale, np.log(1.1) / 2, rtol=1e-5)
+    np.testing.assert_allclose(after.log_scale, (0.3 + np.log(1.1)) / 2, rtol=1e-5)
     assert after.num_scales == 2 and after.depth_noise == pytest.approx(0.04)
     np.testing.assert_array_equal(by_map, np.eye(6))  # the estimate is relative to the map
     same, _ = next_belief(*arguments, np.array(False), np.float32(5.0))

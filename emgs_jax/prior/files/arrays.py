@@ -1,7 +1,8 @@
 """Arrays of files of anyone, checked: what is wrong is named with its file and key."""
 
+import contextlib
 import json
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,15 @@ def files_of(folder: Path, suffix: str) -> list[Path]:
     return [found[row] for row in natural_order(found)[0]]
 
 
+@contextlib.contextmanager
+def reading(path: Path, what: str, *errors: type[Exception]) -> Iterator[None]:
+    """Let what fails here be a ValueError that names the file."""
+    try:
+        yield
+    except (ValueError, OSError, *errors) as error:
+        raise ValueError(f"{path} is no {what} that can be read ({error}): write it again") from error
+
+
 def load_npz(path: Path, names: Sequence[str] = (), optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
     """Arrays of an .npz, compressed or not; ValueError names the file and what it lacks and has."""
     try:
@@ -42,21 +52,15 @@ def names_in(path: Path) -> list[str]:
 
 
 def load_npy(path: Path) -> np.ndarray:
-    """The array of an .npy."""
-    try:
+    with reading(path, ".npy", EOFError):
         return np.load(path, allow_pickle=False)
-    except (ValueError, OSError, EOFError) as error:
-        raise ValueError(f"{path} is no .npy that can be read ({error}): write it again") from error
 
 
 def load_exr(path: Path) -> np.ndarray:
-    """Depths of an OpenEXR file; needs the package OpenEXR."""
+    """Depths of an OpenEXR file; needs the package OpenEXR, which raises what it likes."""
     exr = extra("OpenEXR", f"{path}: EXR needs the package OpenEXR", "exr")
-    try:
-        with exr.File(str(path), separate_channels=True) as file:
-            channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
-    except Exception as error:  # the library raises what it likes
-        raise ValueError(f"{path} is no EXR that can be read ({error}): write it again") from error
+    with reading(path, "EXR", Exception), exr.File(str(path), separate_channels=True) as file:
+        channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
     known = [name for name in EXR_CHANNELS if name in channels] or [*channels][: len(channels) == 1]
     if not known:
         raise ValueError(f"{path} has the channels {', '.join(channels)}: one of {', '.join(EXR_CHANNELS)} is expected")
@@ -64,27 +68,26 @@ def load_exr(path: Path) -> np.ndarray:
 
 
 def load_json(path: Path) -> Any:
-    """Load a JSON file; raises ValueError that names the file where it cannot be read."""
-    try:
+    with reading(path, "JSON", RecursionError):
         return json.loads(path.read_text(encoding="utf-8-sig"))
-    except (ValueError, OSError, RecursionError) as error:
-        raise ValueError(f"{path} is no JSON that can be read ({error}): write it again") from error
 
 
 def load_numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
     """A text file of numbers, inf and nan among them."""
-    try:
+    with reading(path, f"list of numbers {shape}"):
         return np.array([float(word) for word in path.read_text(encoding="utf-8-sig").split()]).reshape(shape)
-    except (ValueError, OSError) as error:
-        raise ValueError(f"{path} must hold numbers {shape} ({error}): write it again") from error
+
+
+def as_numbers(values: Any, where: str, what: str) -> np.ndarray:
+    try:
+        return np.asarray(values, np.float64)
+    except (ValueError, TypeError) as error:
+        raise ValueError(f"{where} must be {what}") from error
 
 
 def as_poses(values: Any, where: str) -> np.ndarray:
     """T_world_camera (n, 4, 4) of (n, 3, 4), (n, 4, 4) or (n, 16); all of a pose is NaN where some is not finite."""
-    try:
-        poses = np.asarray(values, np.float64)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{where} must be a matrix of 4 by 4 numbers, camera -> world") from error
+    poses = as_numbers(values, where, "a matrix of 4 by 4 numbers, camera -> world")
     poses = poses.reshape(-1, 4, 4) if poses.shape[1:] == (16,) else poses
     if poses.shape[1:] == (3, 4):
         poses = np.concatenate([poses, np.broadcast_to([[[0.0, 0.0, 0.0, 1.0]]], (len(poses), 1, 4))], axis=1)
@@ -101,10 +104,7 @@ def as_poses(values: Any, where: str) -> np.ndarray:
 
 def as_intrinsics(values: Any, where: str) -> Intrinsics:
     """fx, fy, cx, cy of four numbers or a camera matrix (3, 3) or (4, 4)."""
-    try:
-        given = np.asarray(values, np.float64)
-    except (ValueError, TypeError) as error:
-        raise ValueError(f"{where} must be [fx, fy, cx, cy] or a camera matrix") from error
+    given = as_numbers(values, where, "[fx, fy, cx, cy] or a camera matrix")
     if given.shape in ((3, 3), (4, 4)):
         if not np.allclose(given[[1, 2, 2, 2], [0, 0, 1, 2]], (0, 0, 0, 1), atol=1e-3):
             raise ValueError(f"{where} must be fx 0 cx, 0 fy cy, 0 0 1, row by row, got {given.tolist()}: transpose it")
@@ -137,14 +137,11 @@ def as_view(
                 f"{confidence.shape}"
             )
         known = confidence[usable(geometry)]
-        if not (np.isfinite(known) & (known >= 1)).all():
-            odd = known[~np.isfinite(known)]
-            worst = odd[0] if len(odd) else known.min()
-            remedy = (
-                "give finite numbers" if len(odd) else "of what begins at 0, such as probabilities, give 1 + confidence"
-            )
+        wrong = known[~((known >= 1) & (known < np.inf))]
+        if len(wrong):
             raise ValueError(
-                f"{source}: confidence must be at least 1 where there is a depth, and is {worst:.3g}: {remedy}"
+                f"{source}: confidence must be finite and at least 1 where there is a depth, and is {wrong[0]:.3g}: of "
+                "what begins at 0, such as probabilities, give 1 + confidence"
             )
     return View(source, geometry, confidence, intrinsics)
 

@@ -1,13 +1,17 @@
 """Do poses and depths fit each other? What is of another convention or unit is found out by the depths of two views."""
 
-from collections.abc import Callable, Iterable, Sequence
+import contextlib
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
+from emgs_jax.data.backprojection import backproject
+from emgs_jax.data.base import BadFrameError, Frame
 from emgs_jax.data.pose_conventions import EXPECTED, READINGS
+from emgs_jax.data.readable import ReadableFrames
 
 MAX_MISFIT = 0.02  # of the depth, median; below, all is right enough whatever else fits
 MIN_GAIN, GOOD_MISFIT = 3.0, 0.05  # by which another convention must fit better to be named, and how well at least
@@ -15,6 +19,8 @@ MIN_SHARED = 100  # points
 STEP = 4  # every fourth pixel of every fourth row
 FACTORS = np.geomspace(1e-3, 1e3, 241)  # of depths in another unit: 6 % apart
 MIN_FACTOR = 2.0  # what is nearer to 1 is a prediction's error
+KNOWN_SCALES = 256.0, 1000.0, 4000.0, 5000.0, 6553.5  # raw units a metre, of KITTI, most sensors, L515, TUM, Replica
+NUM_PAIRS, GAP = 4, 4  # of frames, and how far apart they are
 
 
 class Sight(NamedTuple):
@@ -145,3 +151,51 @@ def _inverse(sight: Sight, factor: float) -> Sight:
 def _stretch(points: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
     """Length of the ray to each point over its depth."""
     return np.linalg.norm(points, axis=-1) / points[..., 2]
+
+
+def check_truth(dataset: ReadableFrames, depth_scale: float | None) -> None:
+    """Raise ValueError where true depths and poses fit each other much better in another unit or convention.
+
+    Args:
+        dataset: with ground truth, else nothing is looked at.
+        depth_scale: raw units a metre by which its depths were read, for which the `KNOWN_SCALES` are tried first;
+            None: it is not known.
+    """
+    if not dataset.has_ground_truth:
+        return
+    pairs, name = [*_pairs(dataset)], f"{dataset.name} {dataset.sequence}"
+    if depth_scale is not None:
+        _check_depth_unit(pairs, depth_scale, dataset.intrinsics, name)
+    check_conventions(pairs, dataset.intrinsics, f"{name}, true poses and depths", np.inf)
+
+
+def _check_depth_unit(
+    pairs: list[tuple[Sight, Sight]], depth_scale: float, intrinsics: tuple[float, ...], name: str
+) -> None:
+    fits = {
+        scale: median_misfit(pairs, intrinsics, partial(times, factor=depth_scale / scale))
+        for scale in (depth_scale, *KNOWN_SCALES)
+    }
+    own, best = fits[depth_scale], min(fits, key=lambda scale: fits[scale])
+    if own > MAX_MISFIT and fits[best] < min(own / MIN_GAIN, GOOD_MISFIT):
+        raise ValueError(
+            f"{name}: with dataset.depth_scale={depth_scale:g} the depths of two frames "
+            f"differ by {100 * own:.1f} % (inf: they share nothing), and by {100 * fits[best]:.1f} % with {best:g} raw "
+            f"units a metre: give dataset.depth_scale={best:g}, or poses in metres"
+        )
+
+
+def _pairs(dataset: ReadableFrames) -> Iterator[tuple[Sight, Sight]]:
+    """Frames with depth and pose, evenly spread; one that cannot be read says so when it is its turn."""
+    for first in np.unique(np.linspace(0, max(len(dataset) - 1 - GAP, 0), NUM_PAIRS).astype(int)).tolist():
+        with contextlib.suppress(BadFrameError):
+            a, b = (dataset[row] for row in (first, min(first + GAP, len(dataset) - 1)))
+            sights = _sight(a, dataset.intrinsics), _sight(b, dataset.intrinsics)
+            if sights[0] is not None and sights[1] is not None:
+                yield sights[0], sights[1]
+
+
+def _sight(frame: Frame, intrinsics: tuple[float, ...]) -> Sight | None:
+    if frame.depth is None or frame.T_world_camera is None:
+        return None
+    return Sight(backproject(frame.depth, intrinsics), frame.depth > 0, frame.T_world_camera)

@@ -16,9 +16,6 @@ def rows_of(
         names: of the predictions in `folder`, without their suffixes.
         may_lack: a frame without a prediction gets None.
         remedy: for such a frame, where none may lack.
-
-    Raises:
-        ValueError: a frame has no prediction or several, or names do not tell and there are not as many as frames.
     """
     files = [dataset.files(index)[:1] for index in range(len(dataset))]
     stems = [file[0].stem if file else "" for file in files]

@@ -8,17 +8,8 @@ import numpy as np
 from emgs_jax.data.file_names import last_number
 from emgs_jax.data.reading import read_depth
 from emgs_jax.io.trajectory import load_trajectory_tum
-from emgs_jax.prior.files.arrays import (
-    as_intrinsics,
-    as_poses,
-    as_view,
-    files_of,
-    load_exr,
-    load_json,
-    load_npy,
-    load_npz,
-    names_in,
-)
+from emgs_jax.prior.files import arrays
+from emgs_jax.prior.files.arrays import as_intrinsics, as_poses, as_view, files_of, load_json, load_npz, names_in
 from emgs_jax.prior.files.view import Predictions, View, whole_image
 
 SUFFIXES = (".npz", ".exr", ".npy", ".png")  # the first that is there is read
@@ -31,11 +22,7 @@ GIVES_POSES = (
 
 
 def read_own(folder: Path, units_per_metre: float) -> Predictions:
-    """A folder with .npz, .exr, .npy or 16-bit .png files, and poses in the .npz, in poses.txt or in poses.json.
-
-    Raises:
-        ValueError: no such file, no poses, a file that is wrong.
-    """
+    """A folder with .npz, .exr, .npy or 16-bit .png files, and poses in the .npz, in poses.txt or in poses.json."""
     suffix = next((suffix for suffix in SUFFIXES if files_of(folder, suffix)), None)
     if suffix is None:
         raise ValueError(
@@ -56,7 +43,8 @@ def read_own(folder: Path, units_per_metre: float) -> Predictions:
         return Predictions("npz", names, poses, source, read_npz, files, True, whole_image, unread=unread)
     given = load_json(lists[0]).get("intrinsics") if lists[0].suffix == ".json" else None
     intrinsics = None if given is None else as_intrinsics(given, f"{lists[0]}: intrinsics")
-    load = {".exr": load_exr, ".npy": load_npy, ".png": partial(read_depth, depth_scale=units_per_metre)}[suffix]
+    png = partial(read_depth, depth_scale=units_per_metre)
+    load = {".exr": arrays.load_exr, ".npy": arrays.load_npy, ".png": png}[suffix]
 
     def read(row: int) -> View:
         return as_view(str(paths[row]), load(paths[row]), None, intrinsics)
@@ -73,28 +61,19 @@ def _own_pose(path: Path) -> np.ndarray:
 
 
 def _read_npz(path: Path) -> View:
-    arrays = load_npz(path, (), KEYS)
-    if ("depth" in arrays) == ("points" in arrays):
+    found = load_npz(path, (), KEYS)
+    if ("depth" in found) == ("points" in found):
         raise ValueError(f"{path} must have depth or points, one of them; it has {', '.join(names_in(path))}")
-    key = "depth" if "depth" in arrays else "points"
-    expected = (2, 3) if key == "depth" else (3,)
-    if arrays[key].ndim not in expected or (
-        arrays[key].ndim == 3 and arrays[key].shape[2] != (1 if key == "depth" else 3)
-    ):
-        raise ValueError(
-            f"{path}: {key} must be {'(h, w)' if key == 'depth' else '(h, w, 3)'}, got {arrays[key].shape}"
-        )
-    given = arrays.get("intrinsics")
+    key = "depth" if "depth" in found else "points"
+    if found[key].shape[2:] not in (((), (1,)) if key == "depth" else ((3,),)):
+        raise ValueError(f"{path}: {key} must be (h, w{', 3' * (key == 'points')}), got {found[key].shape}")
+    given = found.get("intrinsics")
     intrinsics = None if given is None else as_intrinsics(given, f"{path}: intrinsics")
-    return as_view(f"{path}: {key}", arrays[key], arrays.get("confidence"), intrinsics)
+    return as_view(f"{path}: {key}", found[key], found.get("confidence"), intrinsics)
 
 
 def _order(times: np.ndarray, names: list[str], path: Path) -> np.ndarray:
-    """Line of a list of poses for each file: that with the number in its name where all have one, else in order.
-
-    Raises:
-        ValueError: the lines are in another order than that of time, and no names say which.
-    """
+    """Line of a list of poses for each file: that with the number in its name where all have one, else in order."""
     numbers = [last_number(name) for name in names]
     if None not in numbers and len({*numbers}) == len(names) and sorted(times) == sorted(numbers):
         line = {time: row for row, time in enumerate(times)}

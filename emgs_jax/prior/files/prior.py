@@ -20,20 +20,30 @@ from tqdm import tqdm
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.reading import Size, check_depth_scale, fingerprint, orientation, resize_intrinsics
 from emgs_jax.prior.base import (
+    DenseView,
     Prior,
     PriorPrediction,
     Provenance,
     Window,
     check_pose_std,
     equal_covariances,
+    no_points,
+    predicted,
     relative_poses,
 )
 from emgs_jax.prior.files.conventions import MIN_GAIN, Sight, check_conventions, median_misfit
-from emgs_jax.prior.files.exports import find_export, read_cut3r, read_export
+from emgs_jax.prior.files.layouts import (
+    DEPTH_MAPS,
+    find_export,
+    read_colmap_workspace,
+    read_cut3r,
+    read_export,
+    read_record3d,
+    read_scannet,
+)
 from emgs_jax.prior.files.naming import rows_of
 from emgs_jax.prior.files.own import GIVES_POSES, read_own
 from emgs_jax.prior.files.pose_error import pose_angle
-from emgs_jax.prior.files.scans import DEPTH_MAPS, read_colmap_workspace, read_record3d, read_scannet
 from emgs_jax.prior.files.view import Camera, Intrinsics, Predictions, View, at_frame, by_rays, grid_intrinsics, usable
 
 AUTO = "auto"
@@ -83,7 +93,7 @@ class Files(Prior):
         self._pose_std = None if pose_std == AUTO else check_pose_std(pose_std)
         self._is_measured = pose_std == AUTO
         self._rows: list[int | None] = []  # of the frames
-        self._points: dict[int, tuple[np.ndarray, np.ndarray, np.ndarray]] = {}  # of the last window, by frame
+        self._points: dict[int, DenseView] = {}  # of the last window, by frame
         settings = {"layout": self._found.layout, "scale": "metric" if self._is_metric else "arbitrary"}
         settings |= {} if self._is_metric else {"median_depth": float(median_depth)}
         settings |= {"depth_scale": float(depth_scale), "max_depth_step": self._max_depth_step}
@@ -139,11 +149,9 @@ class Files(Prior):
         before, self._points = self._points, {}
         for index in window.dense:
             self._points[index] = before.get(index) or self._at_frame(index, camera)
-        points, confidence, mask = (np.stack(parts) for parts in zip(*self._points.values(), strict=True))
-        features = np.zeros((*mask.shape, 0), np.float16)
         std = self._pose_std and (self._pose_std[0] * self._factor, self._pose_std[1])
         covariance = equal_covariances(std, T_anchor_view)
-        return PriorPrediction(window, T_anchor_view, points, confidence, mask, features, covariance)
+        return predicted(window, T_anchor_view, [*self._points.values()], pose_covariance=covariance)
 
     def _pose(self, index: int) -> np.ndarray:
         """T_world_camera of a frame, NaN where it has none."""
@@ -152,13 +160,11 @@ class Files(Prior):
         pose[:3, 3] *= self._factor
         return pose
 
-    def _at_frame(self, index: int, camera: Camera) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _at_frame(self, index: int, camera: Camera) -> DenseView:
         """Points, confidence and mask of a frame; without a pose or a file none can be used."""
-        width, height = camera.size
         row = self._rows[index]
         if row is None or not np.isfinite(self._found.poses[row]).all():
-            shape = height, width
-            return np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, bool)
+            return no_points(camera.size)
         view = self._found.read(row)
         points, confidence, mask = at_frame(view, camera, self._found.place, self._max_depth_step)
         return points * np.float32(self._factor), confidence, mask

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Float32
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.reading import Size
-from emgs_jax.prior.network.resize import at_pixels
+from emgs_jax.prior.network.resize import at_pixels, on_grid_of
 
 Intrinsics = tuple[float, float, float, float]
 MAX_ASPECT_ERROR = 0.05  # of what shows a whole image: networks round a side to whole patches
@@ -112,10 +112,8 @@ def at_frame(
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Points, confidence and mask of a view at every pixel of the frame, see `resize.at_pixels`.
 
-    The points lie where the view's own calibration has them, at the pixel that shows the same of the image.
-
-    Raises:
-        ValueError: the view does not show what it should.
+    The points lie where the view's own calibration has them, at the pixel that shows the same of the image. ValueError
+    where the view does not show what it should.
     """
     scaled, corner = place(camera, view)
     mask = usable(view.geometry)
@@ -123,12 +121,8 @@ def at_frame(
     geometry = np.where(mask if view.geometry.ndim == 2 else mask[..., None], view.geometry, 0)
     intrinsics = view.intrinsics or grid_intrinsics(camera, Part(scaled, corner))
     points = backproject(geometry, intrinsics) if geometry.ndim == 2 else geometry
-    columns, rows = (
-        (np.arange(size) + 0.5) * (length / size) - 0.5 - start
-        for size, length, start in zip(camera.size, scaled, corner, strict=True)
-    )
     on_grid = points.astype(np.float32), np.where(mask, confidence, 1).astype(np.float32), mask
-    return at_pixels(*on_grid, (columns, rows), max_depth_step)
+    return at_pixels(*on_grid, on_grid_of(camera.size, scaled, corner), max_depth_step)
 
 
 def usable(geometry: Float[np.ndarray, "gh gw *c"]) -> Bool[np.ndarray, "gh gw"]:

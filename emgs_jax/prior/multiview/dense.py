@@ -71,13 +71,12 @@ class Way:
     Args:
         begin: the structure, whose unit it may have changed, and the depth of each frame.
         check: raises ValueError where it does not fit a data set, before anything is computed.
-        contents: what its files hold, for provenance; in place of their paths, the keys `paths` of its config.
+        contents: what its files hold, for provenance.
     """
 
     begin: Callable[[Scene], tuple[Structure, Depths]]
     check: Callable[[Dataset], None] = lambda dataset: None
     contents: Mapping[str, Any] = field(default_factory=dict)
-    paths: tuple[str, ...] = ()
 
 
 def tried_depths(z: np.ndarray, margin: float) -> np.ndarray:

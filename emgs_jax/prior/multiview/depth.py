@@ -6,21 +6,20 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from emgs_jax.ops.camera import Camera, nearest_pixel, project, unproject
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, traced
 from emgs_jax.prior.multiview.plane_sweep import SweepConfig, inverse_depths, smallest, sweep
 from emgs_jax.prior.multiview.semi_global import SemiGlobalConfig, aggregate
+from emgs_jax.prior.sources import Sources
 
 
 class DepthConfig(eqx.Module):
     """Matching, and what a depth must pass.
 
     Args:
-        sweep: matching cost of every plane.
-        semi_global: its aggregation.
         max_cost: of the best plane, before aggregation.
         min_margin: by which the aggregated cost of any plane that is not next to the best must exceed the best's.
         temperature: aggregated cost above the best's at which a plane is 1/e as plausible.
@@ -66,9 +65,7 @@ def _median(depth: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:
 @full_precision
 def estimate_depth(
     gray: Float[Array, "h w"],
-    sources: Float[Array, "s h w"],
-    T_source_reference: jaxlie.SE3,
-    is_used: Bool[Array, "s"],
+    sources: Sources,
     depth_range: Float[Array, "2"],
     camera: Camera,
     config: DepthConfig,
@@ -80,15 +77,12 @@ def estimate_depth(
 
     Args:
         gray: the view, in [0, 1].
-        sources: other views.
-        T_source_reference: view -> other view, batched like `sources`.
-        is_used: sources that count.
+        sources: likewise.
         depth_range: nearest and farthest depth that is tried, m.
         camera: of all views.
-        config: matching and acceptance.
     """
     planes = inverse_depths(depth_range[0], depth_range[1], config.sweep)
-    cost = sweep(gray, sources, T_source_reference, is_used, planes, camera, config.sweep)
+    cost = sweep(gray, sources, planes, camera, config.sweep)
     total = aggregate(cost, gray, config.semi_global)
     best = jnp.argmin(total, axis=-1)
     is_near_best = jnp.abs(jnp.arange(planes.shape[0]) - best[..., None]) <= 1
@@ -103,12 +97,7 @@ def estimate_depth(
 
 @full_precision
 def mean_difference(
-    depth: Float[Array, "h w"],
-    others: Float[Array, "s h w"],
-    T_other_reference: jaxlie.SE3,
-    is_used: Bool[Array, "s"],
-    camera: Camera,
-    depth_step: Float[Array, ""],
+    depth: Float[Array, "h w"], others: Sources, camera: Camera, depth_step: Float[Array, ""]
 ) -> Float[Array, "h w"]:
     """By what fraction other depth maps differ from each depth, -δ₀ log mean exp(-d / δ₀); inf where none has any.
 
@@ -117,9 +106,7 @@ def mean_difference(
 
     Args:
         depth: of the view, m; 0 = none.
-        others: of other views, likewise.
-        T_other_reference: view -> other view, batched like `others`.
-        is_used: others that count.
+        others: with theirs.
         camera: of all views.
         depth_step: δ₀, as a fraction.
     """
@@ -134,23 +121,21 @@ def mean_difference(
         difference = jnp.abs(seen_depth / jnp.where(is_seen, there, 1.0) - 1.0)
         return jnp.where(is_seen, jnp.exp(-difference / depth_step), 0.0)
 
-    agreed = jnp.mean(jax.vmap(agrees)(T_other_reference.wxyz_xyz, others), axis=0, where=is_used[:, None, None])
+    agreed = jax.vmap(agrees)(others.T_source_view.wxyz_xyz, others.views)
+    agreed = jnp.mean(agreed, axis=0, where=others.is_used[:, None, None])
     return jnp.where(agreed > 0, -depth_step * jnp.log(jnp.where(agreed > 0, agreed, 1.0)), jnp.inf)
 
 
 @full_precision
-def pixels_per_log_depth(
-    depth: Float[Array, "h w"], T_source_reference: jaxlie.SE3, is_used: Bool[Array, "s"], camera: Camera
-) -> Float[Array, "h w"]:
+def pixels_per_log_depth(depth: Float[Array, "h w"], sources: Sources, camera: Camera) -> Float[Array, "h w"]:
     """By how many pixels each point moves in a source while log z grows by one, in that where it moves most.
 
     0 where no source shows the point, or its ray goes through the sources' centres. A depth of 0 has no point.
 
     Args:
         depth: of the view, m.
-        T_source_reference: view -> source, batched like `is_used`.
-        is_used: sources that count.
-        camera: of all views.
+        sources: whose views are not looked at.
+        camera: of all.
     """
     points = unproject(camera, depth)
 
@@ -165,4 +150,4 @@ def pixels_per_log_depth(
         is_shown = used & (depth > 0) & (seen_depth > 0) & nearest_pixel(pixels, depth.shape)[1]
         return jnp.where(is_shown, jnp.linalg.norm(speed, axis=-1), 0.0)
 
-    return jnp.max(jax.vmap(moves)(T_source_reference.wxyz_xyz, is_used), axis=0)
+    return jnp.max(jax.vmap(moves)(sources.T_source_view.wxyz_xyz, sources.is_used), axis=0)

@@ -56,11 +56,7 @@ class DepthFiles(NamedTuple):
 
 
 def way_of_files(config: DepthFilesConfig) -> Way:
-    """The way to depth that reads it.
-
-    Raises:
-        ValueError: no files, or none that can be read.
-    """
+    """The way to depth that reads it; ValueError where there are no files, or none that can be read."""
     folder = Path(config.folder).expanduser()
     found = open_depths(folder, config.kind, check_depth_scale(config.depth_scale, "prior.dense.depth_scale"))
 
@@ -77,7 +73,7 @@ def way_of_files(config: DepthFilesConfig) -> Way:
         return begin_monocular(scene, values, config)
 
     root = folder if folder.is_dir() else folder.parent
-    return Way(begin, check, {"fingerprint": fingerprint(root, found.files, {})}, ("folder",))
+    return Way(begin, check, {"fingerprint": fingerprint(root, found.files, {})})
 
 
 def open_depths(folder: Path, kind: str, depth_scale: float) -> DepthFiles:

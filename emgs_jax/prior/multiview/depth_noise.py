@@ -46,7 +46,6 @@ def relative_std(
         pixels: g, see `pixels_per_log_depth`.
         spread: s, see `Stereo`.
         difference: δ, see `mean_difference`.
-        config: the three factors.
     """
     by_match = config.pixel_std / np.where(pixels > 0, pixels, 1.0)
     parts = by_match, config.spread_std * spread, config.difference_std * difference

@@ -156,18 +156,13 @@ def _check_kind(samples: Sequence[_Sample], kind: str, config: LandmarkFitConfig
     found = float(np.median([np.corrcoef(rankdata(s.u), rankdata(s.y))[0, 1] for s in samples]))
     if np.isfinite(found) and found >= config.min_correlation:
         return
-    said = f"prior.dense.kind={kind}, but the landmarks' {'inverse depths' if kind == 'affine_inverse' else 'depths'}"
+    quantities = ["depths (affine, up_to_scale, metric)", "inverse depths (affine_inverse)"]
+    said, other = quantities[::-1] if kind == "affine_inverse" else quantities
+    hint = "are they of these frames, in their order, and of the whole image?"
     if found <= -config.min_correlation:
-        other = (
-            "depths (affine, up_to_scale, metric)" if kind == "affine_inverse" else "inverse depths (affine_inverse)"
-        )
-        raise ValueError(
-            f"{said} fall where these values grow (rank correlation {found:.2f}): they are {other}, or the "
-            "structure is inside out, as one of images from nearly one place may be (give more of them)"
-        )
+        hint = f"they are {other}, or the structure is inside out, as one of images from nearly one place (give more)"
     raise ValueError(
-        f"{said} have nothing to do with these values (rank correlation {found:.2f}): are they of these frames, in "
-        "their order, and of the whole image?"
+        f"prior.dense.kind={kind}: the rank correlation of values and landmarks' {said} is {found:.2f}: {hint}"
     )
 
 

@@ -51,7 +51,6 @@ def landmarks_of(
 
     Args:
         information: of the points of its world.
-        camera: of the frame.
         cell: side of a cell, as a share of the image's longer side.
     """
     points, T = structure.shown(frame), structure.T_world_camera[frame]

@@ -1,7 +1,7 @@
 """Dense depth by a network for multi-view stereo, whose weights the user brings."""
 
 from dataclasses import dataclass
-from types import ModuleType
+from functools import cache
 from typing import Any
 
 import cv2
@@ -11,33 +11,20 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.pytree import stack
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.lens import Lens, rectify
-from emgs_jax.prior.multiview.matched import Matched, MatchedConfig, Stereo
+from emgs_jax.prior.multiview.matched import MatchedConfig, Stereo
 from emgs_jax.prior.multiview.swept import SweptConfig
 from emgs_jax.prior.pretrained import effimvs, itermvs
 from emgs_jax.prior.pretrained.effimvs import EffiMVSConfig
 from emgs_jax.prior.pretrained.itermvs import IterMVSConfig
-from emgs_jax.prior.pretrained.matching import Sources
 from emgs_jax.prior.pretrained.weights import load_network
+from emgs_jax.prior.sources import Sources
 
 MULTIPLE = 32  # of pixels; the networks halve their images five times
 
 
-@eqx.filter_jit
-def jitted_extract(network: eqx.Module, image: Float[Array, "h w 3"], config: IterMVSConfig | EffiMVSConfig) -> Any:
-    """`extract` of the network that the config is for."""
-    return module_of(config).extract(network, image)
-
-
-@eqx.filter_jit
-def jitted_estimate(
-    network: eqx.Module, matched: Matched, grid: Camera, config: IterMVSConfig | EffiMVSConfig
-) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """`estimate` of what is matched, with images of another camera."""
-    sources = Sources(stack(matched.sources), matched.T_source_view, matched.is_used)
-    return module_of(config).estimate(network, matched.view, sources, matched.depth_range, grid, config)
+jitted = cache(eqx.filter_jit)  # one for all priors of a process
 
 
 @dataclass(frozen=True)
@@ -45,7 +32,6 @@ class LearnedConfig(MatchedConfig):
     """Depth by a network.
 
     Args:
-        network: its sizes.
         magnification: of the images that it is shown, then rounded to what it can take.
         checkpoint: path of its weights.
         sha256: of that file, in hexadecimal digits.
@@ -59,11 +45,6 @@ class LearnedConfig(MatchedConfig):
     beside: SweptConfig | None
 
 
-def module_of(config: IterMVSConfig | EffiMVSConfig) -> ModuleType:
-    """The module of the network that a config is for."""
-    return effimvs if isinstance(config, EffiMVSConfig) else itermvs
-
-
 def grid_of(camera: Camera, magnification: float) -> Camera:
     """The camera of the images that the network is shown: edges lie on edges."""
     size = np.array([camera.width, camera.height])
@@ -74,7 +55,7 @@ def grid_of(camera: Camera, magnification: float) -> Camera:
 
 def learned(config: LearnedConfig) -> Stereo:
     """Depth of RGB images by a network; the spread is -log of its confidence."""
-    module = module_of(config.network)
+    module = effimvs if isinstance(config.network, EffiMVSConfig) else itermvs
     network = load_network(config.checkpoint, config.sha256, module.SOURCE, "model", module.build_network)
 
     def prepare(image: np.ndarray, lens: Lens) -> Any:
@@ -82,12 +63,14 @@ def learned(config: LearnedConfig) -> Stereo:
         grid = grid_of(Camera(lens.focal, lens.center, *image.shape[1::-1]), config.magnification)
         way = cv2.INTER_AREA if grid.width < image.shape[1] else cv2.INTER_LINEAR
         resized = cv2.resize(shown, (grid.width, grid.height), interpolation=way)
-        return jitted_extract(network, jnp.asarray(resized), config.network)
+        return jitted(module.extract)(network, jnp.asarray(resized))
 
-    def depth_of(matched: Matched) -> tuple[np.ndarray, np.ndarray]:
-        grid = grid_of(matched.camera, config.magnification)
-        depth, confidence = map(np.asarray, jitted_estimate(network, matched, grid, config.network))
-        size = matched.camera.width, matched.camera.height
+    def depth_of(
+        view: Any, sources: Sources, depth_range: Float[Array, "2"], camera: Camera
+    ) -> tuple[np.ndarray, np.ndarray]:
+        grid, size = grid_of(camera, config.magnification), (camera.width, camera.height)
+        found = jitted(module.estimate)(network, view, sources, depth_range, grid, config.network)
+        depth, confidence = map(np.asarray, found)
         inverse, confidence = (cv2.resize(values, size) for values in (1.0 / depth, confidence))
         return 1.0 / inverse, -np.log(confidence)
 

@@ -1,21 +1,21 @@
 """Depth of a view that is matched with others: which they are, and what of them is kept."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
+from jaxtyping import Array, Float
 
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.dense import DenseConfig, Depth, Depths, Scene, tried_depths
 from emgs_jax.prior.multiview.depth import pixels_per_log_depth
 from emgs_jax.prior.multiview.lens import Lens
-from emgs_jax.prior.multiview.sources import choose, parallax, placed_beside, relative
+from emgs_jax.prior.sources import Sources, choose, parallax, placed_beside, sources_of
 from emgs_jax.structure.model import Structure
 
 jitted_pixels = eqx.filter_jit(pixels_per_log_depth)
@@ -35,37 +35,18 @@ class MatchedConfig(DenseConfig):
     best_parallax_rad: float = number(low=1e-6, high=4)
 
 
-class Matched(NamedTuple):
-    """A view and those that it is matched with.
-
-    Args:
-        view: what `Stereo.prepare` made of its image.
-        sources: likewise; `num_sources` of them.
-        T_source_view: view -> source, batched like `sources`.
-        is_used: (s,) sources that count; the others are repetitions.
-        depth_range: nearest and farthest depth that is tried, m.
-        camera: of all views.
-    """
-
-    view: Any
-    sources: Sequence[Any]
-    T_source_view: jaxlie.SE3
-    is_used: np.ndarray
-    depth_range: np.ndarray
-    camera: Camera
-
-
 class Stereo(NamedTuple):
     """How a view is matched.
 
     Args:
         prepare: RGB image (h, w, 3), uint8, and its lens -> what is kept of the view.
-        estimate: depth (h, w) in metres, 0 where it is not known, and the spread of what its cost curve takes
-            for plausible, a multiple of the standard deviation of log z.
+        estimate: what is kept of the view and of its sources, nearest and farthest depth that is tried (m), camera ->
+            depth (h, w) in metres, 0 where it is not known, and the spread of what its cost curve takes for plausible,
+            a multiple of the standard deviation of log z.
     """
 
     prepare: Callable[[np.ndarray, Lens], Any]
-    estimate: Callable[[Matched], tuple[np.ndarray, np.ndarray]]
+    estimate: Callable[[Any, Sources, Float[Array, "2"], Camera], tuple[np.ndarray, np.ndarray]]
 
 
 def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[Structure, Depths]:
@@ -77,29 +58,21 @@ def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[
         return stereo.prepare(scene.dataset[frame].image, scene.lenses[found.world[frame]])
 
     def depth_of(frame: int) -> Depth:
-        nothing = np.zeros((scene.camera.height, scene.camera.width), np.float32)
-        sources, z = sources_of(found, frame, config), found.depths(frame)
+        others, z = chosen(found, frame, config), found.depths(frame)
         z = z[z > 0]
-        if not sources or not len(z):
+        if not others or not len(z):
+            nothing = np.zeros((scene.camera.height, scene.camera.width), np.float32)
             return Depth(nothing, nothing, nothing)
-        is_used = np.arange(config.num_sources) < len(sources)
-        sources = (sources * config.num_sources)[: config.num_sources]
-        matched = Matched(
-            view(frame),
-            [view(other) for other in sources],
-            relative(found, sources, frame),
-            is_used,
-            tried_depths(z, config.depth_margin),
-            scene.camera,
-        )
-        depth, spread = stereo.estimate(matched)
-        seen = jnp.asarray(depth), matched.T_source_view, jnp.asarray(is_used), scene.camera
-        return Depth(depth, spread, np.asarray(jitted_pixels(*seen)))
+        sources = sources_of(found, frame, others, config.num_sources, view)
+        depth_range = jnp.asarray(tried_depths(z, config.depth_margin))
+        depth, spread = stereo.estimate(view(frame), sources, depth_range, scene.camera)
+        pixels = jitted_pixels(jnp.asarray(depth), sources._replace(views=None), scene.camera)
+        return Depth(depth, spread, np.asarray(pixels))
 
     return found, depth_of
 
 
-def sources_of(found: Structure, frame: int, config: MatchedConfig) -> list[int]:
+def chosen(found: Structure, frame: int, config: MatchedConfig) -> list[int]:
     """The views that together show the view's landmarks under most parallax, best first."""
     landmarks, points, center = found.landmarks[frame], found.shown(frame), found.T_world_camera[frame, :3, 3]
     worth = {}
@@ -107,5 +80,5 @@ def sources_of(found: Structure, frame: int, config: MatchedConfig) -> list[int]
         is_shown = np.isin(landmarks, found.landmarks[other], assume_unique=True)
         if is_shown.any():
             angle = parallax(points, center, found.T_world_camera[other, :3, 3])
-            worth[int(other)] = is_shown * np.minimum(angle / config.best_parallax_rad, 1.0)
+            worth[other] = is_shown * np.minimum(angle / config.best_parallax_rad, 1.0)
     return choose(worth, config.num_sources)

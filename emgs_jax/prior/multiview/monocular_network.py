@@ -25,8 +25,7 @@ class MeterConfig(MonocularConfig):
     """Depth by METER.
 
     Args:
-        width: of the images that it is shown, in pixels; a multiple of 64.
-        height: likewise.
+        width, height: of the images that it is shown, in pixels; multiples of 64.
         checkpoint: path of its weights.
         sha256: of that file, in hexadecimal digits.
     """
@@ -38,11 +37,7 @@ class MeterConfig(MonocularConfig):
 
 
 def way_of_meter(config: MeterConfig) -> Way:
-    """The way to depth that shows it each image.
-
-    Raises:
-        ValueError: the file is not that of the published weights.
-    """
+    """The way to depth that shows it each image; ValueError where the file is not that of the published weights."""
     network = load_network(config.checkpoint, config.sha256, SOURCE, None, build_network)
 
     def begin(scene: Scene) -> tuple[Structure, Depths]:
@@ -57,4 +52,4 @@ def way_of_meter(config: MeterConfig) -> Way:
 
         return begin_monocular(scene, values, config)
 
-    return Way(begin, paths=("checkpoint",))
+    return Way(begin)

@@ -45,13 +45,9 @@ class PlanarConfig:
     correlation: float = number(low=0)
 
 
-def _square(radius: int) -> np.ndarray:
-    return np.ones((2 * radius + 1,) * 2, np.uint8)
-
-
 def blank_regions(gray: Float[np.ndarray, "h w"], config: PlanarConfig) -> Iterator[Bool[np.ndarray, "h w"]]:
     """The connected regions without texture, each with the surroundings in which its pixels have none."""
-    around = _square(config.radius)
+    around = np.ones((2 * config.radius + 1,) * 2, np.uint8)
     is_blank = cv2.dilate(gray, around) - cv2.erode(gray, around) < config.max_contrast
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(is_blank.astype(np.uint8), connectivity=4)
     for label in range(1, count):
@@ -67,7 +63,6 @@ def fit_plane(
     Args:
         pixels: (u, v, 1) of the matches.
         inverse: their inverse depths, in planes of the sweep.
-        config: draws and tolerance.
     """
     draws = np.random.default_rng(0).integers(len(pixels), size=(config.num_draws, 3))
     planes = np.einsum("dij,dj->di", np.linalg.pinv(pixels[draws]), inverse[draws])
@@ -106,7 +101,6 @@ def fill_planes(
         spread: its uncertainty in planes of the sweep.
         gray: the image, in [0, 1].
         spacing: 1/m between the planes of the sweep.
-        config: which regions become planes.
     """
     height, width = depth.shape
     v, u = np.mgrid[:height, :width]

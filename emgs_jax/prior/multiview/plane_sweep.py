@@ -3,11 +3,11 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
-from jaxtyping import Array, Bool, Float, UInt32
+from jaxtyping import Array, Float, UInt32
 
 from emgs_jax.ops.camera import Camera, nearest_pixel, pixel_grid, project, rays
 from emgs_jax.ops.pytree import static, traced
+from emgs_jax.prior.sources import Sources
 
 
 class SweepConfig(eqx.Module):
@@ -44,7 +44,6 @@ def census(gray: Float[Array, "h w"], config: SweepConfig, scale: int = 1) -> UI
 
     Args:
         gray: in [0, 1].
-        config: the neighbours.
         scale: spacing of the neighbours in pixels of `gray` is that many times the config's.
     """
     reach = scale * config.census_radius
@@ -84,31 +83,22 @@ def smallest(values: Float[Array, "s h w"], count: int) -> Float[Array, "k h w"]
 
 
 def sweep(
-    gray: Float[Array, "h w"],
-    sources: Float[Array, "s h w"],
-    T_source_reference: jaxlie.SE3,
-    is_used: Bool[Array, "s"],
-    planes: Float[Array, "d"],
-    camera: Camera,
-    config: SweepConfig,
+    gray: Float[Array, "h w"], sources: Sources, planes: Float[Array, "d"], camera: Camera, config: SweepConfig
 ) -> Float[Array, "h w d"]:
     """Matching cost of every plane at every pixel, 0 (all comparisons agree) to 1.
 
     The codes of the sources are taken at half a pixel's resolution, without interpolation.
 
     Args:
-        gray: reference image in [0, 1].
-        sources: other images of the same camera.
-        T_source_reference: reference camera -> source camera, batched like `sources`.
-        is_used: sources that count.
+        gray: the view, in [0, 1].
+        sources: likewise.
         planes: inverse depths, 1/m.
-        camera: of all images.
-        config: planes and cost.
+        camera: of all views.
     """
     reference = census(gray, config)
-    codes = jax.vmap(lambda image: census(_double(image), config, scale=2))(sources)
+    codes = jax.vmap(lambda image: census(_double(image), config, scale=2))(sources.views)
     num_taps = len(_taps(config))
-    rotations = T_source_reference.rotation().as_matrix()
+    rotations = sources.T_source_view.rotation().as_matrix()
     directions = jnp.einsum("sij,hwj->shwi", rotations, rays(camera, pixel_grid(camera)))
 
     def plane_cost(plane: Array) -> Array:
@@ -119,7 +109,7 @@ def sweep(
             differing = jax.lax.population_count(code.reshape(-1)[index] ^ reference).astype(jnp.float32)
             return jnp.where(inside & (depth > 0) & used, differing / num_taps, config.unseen_cost)
 
-        costs = jax.vmap(source_cost)(directions, T_source_reference.translation(), codes, is_used)
+        costs = jax.vmap(source_cost)(directions, sources.T_source_view.translation(), codes, sources.is_used)
         return jnp.mean(smallest(costs, config.num_best), axis=0)
 
     return jnp.moveaxis(jax.lax.map(plane_cost, planes), 0, -1)

@@ -25,7 +25,7 @@ import numpy as np
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
-from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
+from emgs_jax.prior.base import DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
 from emgs_jax.prior.multiview.dense import DenseConfig, Depths, Scene, Way
 from emgs_jax.prior.multiview.depth import mean_difference
 from emgs_jax.prior.multiview.depth_files import DepthFilesConfig, way_of_files
@@ -34,8 +34,8 @@ from emgs_jax.prior.multiview.learned import LearnedConfig, learned
 from emgs_jax.prior.multiview.lens import Lens, as_shown, lens_of, points_shown
 from emgs_jax.prior.multiview.matched import begin_matched
 from emgs_jax.prior.multiview.monocular_network import MeterConfig, way_of_meter
-from emgs_jax.prior.multiview.sources import placed_beside, relative
 from emgs_jax.prior.multiview.swept import SweptConfig, swept
+from emgs_jax.prior.sources import placed_beside, sources_of
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.model import NONE, Structure
 from emgs_jax.structure.sequence import structure_of
@@ -51,9 +51,8 @@ def way_of(config: AnyDense) -> Way:
         return way_of_files(config)
     if isinstance(config, MeterConfig):
         return way_of_meter(config)
-    if isinstance(config, LearnedConfig):  # its digest says which checkpoint it is, wherever it lies
-        return Way(partial(begin_matched, stereo=learned(config), config=config), paths=("checkpoint",))
-    return Way(partial(begin_matched, stereo=swept(config), config=config))
+    stereo = learned(config) if isinstance(config, LearnedConfig) else swept(config)
+    return Way(partial(begin_matched, stereo=stereo, config=config))
 
 
 def in_order(config: AnyDense) -> tuple[AnyDense, ...]:
@@ -63,8 +62,8 @@ def in_order(config: AnyDense) -> tuple[AnyDense, ...]:
 
 
 def _described(config: AnyDense, way: Way) -> dict:
-    """Settings without paths, which its contents stand for, and without the way beside it."""
-    left_out = *way.paths, "beside"
+    """Settings without paths, which digest or contents stand for, and without the way beside it."""
+    left_out = "folder", "checkpoint", "beside"
     return {key: value for key, value in _values(config).items() if key not in left_out} | dict(way.contents)
 
 
@@ -75,12 +74,7 @@ def _values(config: StructureConfig | DenseConfig) -> dict:
 
 
 class MultiviewStereo(Prior):
-    """Structure from motion of all images, and stereo of each with others.
-
-    Args:
-        structure: poses and landmarks.
-        dense: depth.
-    """
+    """Structure from motion of all images, and dense depth of each."""
 
     def __init__(self, structure: StructureConfig, dense: AnyDense) -> None:
         self._config, self._ways = structure, [(config, way_of(config)) for config in in_order(dense)]
@@ -129,8 +123,6 @@ class MultiviewStereo(Prior):
         """Poses of all views and depth of `window.dense`; a view that no model holds has NaN and no valid point."""
         self._prepare()
         structure, world = self._found, self._world_at(window.current)
-        depths = [self._answer(frame) for frame in window.dense]
-        points, confidence, mask = (np.stack(found) for found in zip(*depths, strict=True))
         T, spread = np.full((len(window.views), 4, 4), np.nan), np.full((len(window.views), 6, 6), np.nan)
         anchor = window.views[0]
         is_same = structure.world[anchor] == world
@@ -139,9 +131,9 @@ class MultiviewStereo(Prior):
             if structure.world[frame] == world:
                 T[row] = np.eye(4) if frame == anchor else T_anchor_world @ structure.T_world_camera[frame]
                 spread[row] = structure.covariance[frame]
-        features = np.zeros((*mask.shape, 0), np.float16)
+        dense = [self._answer(frame) for frame in window.dense]
         known = {"pose_covariance": spread, "scale_std": self._scale_std(window.current), "world": world}
-        return PriorPrediction(window, T, points, confidence, mask, features, **known)
+        return predicted(window, T, dense, **known)
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
         """Predict for views of two visits of a place; None where they are not in one world."""
@@ -176,11 +168,9 @@ class MultiviewStereo(Prior):
         placed = np.flatnonzero(self._found.world[: frame + 1] != NONE)
         return int(self._found.world[placed[-1]]) if len(placed) else 0
 
-    def _answer(self, frame: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points (h, w, 3), confidence and mask of a frame's pixels."""
+    def _answer(self, frame: int) -> DenseView:
         if not self._found.is_placed[frame]:
-            nothing = np.zeros((self._camera.height, self._camera.width), np.float32)
-            return np.zeros((*nothing.shape, 3), np.float32), nothing + 1, nothing > 0
+            return no_points((self._camera.width, self._camera.height))
         lens, accepted = self._lenses[self._found.world[frame]], []
         for depths, (config, _) in zip(self._depths, self._ways, strict=True):
             std = self._std(frame, depths, config)
@@ -200,18 +190,9 @@ class MultiviewStereo(Prior):
     def _std(self, frame: int, depths: Depths, config: DenseConfig) -> np.ndarray:
         """Standard deviation of the logarithm of each depth; inf where there is no telling."""
         depth, spread, pixels, _ = depths(frame)
-        count = config.num_checks
-        others = [int(other) for other in placed_beside(self._found, frame)[:count]]
+        others = placed_beside(self._found, frame)[: config.num_checks]
         if not others:
             return np.full_like(depth, np.inf)
-        is_used = np.arange(count) < len(others)
-        others = (others * count)[:count]
-        difference = jitted_difference(
-            jnp.asarray(depth),
-            jnp.asarray(np.stack([depths(other).depth for other in others])),
-            relative(self._found, others, frame),
-            jnp.asarray(is_used),
-            self._camera,
-            jnp.float32(config.depth_step),
-        )
+        seen = sources_of(self._found, frame, others, config.num_checks, lambda other: jnp.asarray(depths(other).depth))
+        difference = jitted_difference(jnp.asarray(depth), seen, self._camera, jnp.float32(config.depth_step))
         return relative_std(pixels, spread, np.asarray(difference), config.noise)

@@ -6,23 +6,21 @@ import cv2
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array, Float
 
+from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.depth import DepthConfig, estimate_depth
 from emgs_jax.prior.multiview.lens import Lens, rectify
-from emgs_jax.prior.multiview.matched import Matched, MatchedConfig, Stereo
+from emgs_jax.prior.multiview.matched import MatchedConfig, Stereo
 from emgs_jax.prior.multiview.planar import PlanarConfig, fill_planes
+from emgs_jax.prior.sources import Sources
 
 jitted_depth = eqx.filter_jit(estimate_depth)
 
 
 @dataclass(frozen=True)
 class SweptConfig(MatchedConfig):
-    """Depth by a plane sweep.
-
-    Args:
-        depth: matching and acceptance.
-        planar: blank regions that become planes.
-    """
+    """Depth by a plane sweep, and blank regions that become planes."""
 
     depth: DepthConfig
     planar: PlanarConfig
@@ -34,19 +32,13 @@ def swept(config: SweptConfig) -> Stereo:
     def prepare(image: np.ndarray, lens: Lens) -> np.ndarray:
         return rectify(np.float32(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) / 255.0, lens)
 
-    def estimate(matched: Matched) -> tuple[np.ndarray, np.ndarray]:
-        near, far = matched.depth_range
-        depth, spread = jitted_depth(
-            jnp.asarray(matched.view),
-            jnp.asarray(np.stack(matched.sources)),
-            matched.T_source_view,
-            jnp.asarray(matched.is_used),
-            jnp.asarray(matched.depth_range),
-            matched.camera,
-            config.depth,
-        )
+    def estimate(
+        view: np.ndarray, sources: Sources, depth_range: Float[Array, "2"], camera: Camera
+    ) -> tuple[np.ndarray, np.ndarray]:
+        depth, spread = jitted_depth(jnp.asarray(view), sources, depth_range, camera, config.depth)
+        near, far = np.asarray(depth_range)
         spacing = (1.0 / near - 1.0 / far) / (config.depth.sweep.num_planes - 1)
-        depth, planes = fill_planes(np.asarray(depth), np.asarray(spread), matched.view, spacing, config.planar)
+        depth, planes = fill_planes(np.asarray(depth), np.asarray(spread), view, spacing, config.planar)
         return depth, planes * spacing * depth
 
     return Stereo(prepare, estimate)

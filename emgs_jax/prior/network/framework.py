@@ -2,13 +2,14 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
 
 import numpy as np
 
+from emgs_jax.features.checkpoint import BACKBONE
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.network.resize import Resize, Size, resize_intrinsics
 
@@ -18,7 +19,6 @@ NORMALIZATIONS = {  # of RGB in [0, 1]: mean, standard deviation
     "dust3r": ((0.5, 0.5, 0.5), (0.5, 0.5, 0.5)),
     "identity": ((0.0, 0.0, 0.0), (1.0, 1.0, 1.0)),
 }
-CHECKPOINT_FILES = ("config.json", "model.safetensors")
 DINOV2_CLONE = "facebookresearch_dinov2_main"  # the name that torch.hub gives to its copy of the repository
 DOWNLOAD = "hf download facebook/map-anything-apache --local-dir FOLDER"
 
@@ -112,18 +112,9 @@ class ComputeConfig:
     """
 
     device: str | None
-    amp: str
+    amp: str = field(metadata={"choices": ("bf16", "fp16", "float32")})
     memory_efficient: bool
     minibatch_size: int | None = number(low=1)
-
-
-@dataclass(frozen=True)
-class NetworkSettings:
-    """Choice of a network: key of `MODELS`, folder of the checkpoint (`mapanything` only), and how it runs."""
-
-    model: str
-    checkpoint: Path | None
-    compute: ComputeConfig
 
 
 class Network(Protocol):
@@ -154,6 +145,12 @@ class ViewOutput:
     is_clear: np.ndarray
     T_reference_view: np.ndarray
     intrinsics: np.ndarray
+
+    def times(self, scale: float) -> "ViewOutput":
+        """The same view in another unit of length."""
+        pose = self.T_reference_view.copy()
+        pose[:3, 3] *= scale
+        return replace(self, points=self.points * np.float32(scale), T_reference_view=pose)
 
 
 def build_views(
@@ -216,7 +213,7 @@ def check_checkpoint(folder: Path | None, hub: Path) -> None:
     """
     if folder is None:
         raise ValueError(f"prior.checkpoint is not set: download the weights once ({DOWNLOAD}) and name the FOLDER")
-    missing = [name for name in CHECKPOINT_FILES if not (folder / name).is_file()]
+    missing = [name for name in BACKBONE if not (folder / name).is_file()]
     if missing:
         raise ValueError(f"{folder} has no {' and no '.join(missing)}: prior.checkpoint is the FOLDER of {DOWNLOAD}")
     path = folder / "config.json"

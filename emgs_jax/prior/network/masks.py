@@ -1,22 +1,26 @@
-"""Masks of the usable pixels of a network's output: MapAnything's masks as pure functions on its own grid.
+"""Masks of the usable pixels of a network's output: MapAnything's criteria, on the network's grid.
 
 A pixel is left out where the network calls it ambiguous, where its confidence is among the lowest of its view, on
 edges, and where other views of the window contradict its depth. Every part has a neutral value that turns it off.
+Upstream's own functions miss edges where rounding makes a cosine larger than 1.
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import dataclass
 
-import equinox as eqx
-import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float
 
 from emgs_jax.ops.camera import NEAREST_DEPTH
-from emgs_jax.ops.linalg import safe_normalize
-from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import traced
+from emgs_jax.ops.ranges import number
+
+SQUARE = np.ones((3, 3), np.uint8)
 
 
-class MaskConfig(eqx.Module):
+@dataclass(frozen=True)
+class MaskConfig:
     """Criteria by which a pixel is left out. Upstream's defaults are in conf/prior/mapanything.yaml.
 
     Args:
@@ -30,150 +34,125 @@ class MaskConfig(eqx.Module):
         consistent_depth_share: this fraction of the depth.
     """
 
-    drop_ambiguous: Float[Array, "*b"] = traced(low=0, high=1)
-    confidence_percentile: Float[Array, "*b"] = traced(low=0, high=100)
-    max_edge_step: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    max_edge_degrees: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    min_consistent_share: Float[Array, "*b"] = traced(low=0, high=1)
-    consistent_depth_m: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    consistent_depth_share: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    drop_ambiguous: float = number(low=0, high=1)
+    confidence_percentile: float = number(low=0, high=100)
+    max_edge_step: float = number(low=0, high=math.inf)
+    max_edge_degrees: float = number(low=0, high=math.inf)
+    min_consistent_share: float = number(low=0, high=1)
+    consistent_depth_m: float = number(low=0, high=math.inf)
+    consistent_depth_share: float = number(low=0, high=math.inf)
 
 
-def _around(image: Array, fill: float | bool | None) -> list[Array]:
-    """The 3 × 3 neighbours of every pixel, row by row; `fill` beyond the border, the border's own value for None."""
+def usable(
+    points: Float[np.ndarray, "h w 3"],
+    confidence: Float[np.ndarray, "h w"],
+    is_clear: Bool[np.ndarray, "h w"],
+    config: MaskConfig,
+) -> Bool[np.ndarray, "h w"]:
+    """The mask of one view by itself.
+
+    Args:
+        points: camera frame, metres.
+        confidence: higher is better; one that is the same everywhere is never low.
+        is_clear: what the network does not call ambiguous.
+    """
+    is_known = np.isfinite(confidence)
+    valid = np.isfinite(points).all(axis=-1) & (points[..., 2] > 0) & is_known
+    valid &= is_clear | (config.drop_ambiguous <= 0)
+    if config.confidence_percentile > 0:
+        confidence = np.where(is_known, confidence, 0)
+        least = np.percentile(confidence, config.confidence_percentile)
+        valid &= (confidence > least) | (confidence == confidence.max())
+    points = np.where(valid[..., None], points, 0)
+    is_edge = normal_edges(points, valid, config.max_edge_degrees)
+    return valid & ~(is_edge & depth_edges(points[..., 2], valid, config.max_edge_step))
+
+
+def _shifted(image: np.ndarray, shifts: Sequence[tuple[int, int]], mode: str) -> list[np.ndarray]:
+    """What lies so many rows and columns beside every pixel."""
     height, width = image.shape[:2]
-    padding = [(1, 1), (1, 1)] + [(0, 0)] * (image.ndim - 2)
-    padded = jnp.pad(image, padding, mode="edge") if fill is None else jnp.pad(image, padding, constant_values=fill)
-    return [padded[dy : dy + height, dx : dx + width] for dy in range(3) for dx in range(3)]
+    padded = np.pad(image, [(1, 1), (1, 1)] + [(0, 0)] * (image.ndim - 2), mode=mode)
+    return [padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width] for dy, dx in shifts]
 
 
 def grid_normals(
-    points: Float[Array, "h w 3"], valid: Bool[Array, "h w"]
-) -> tuple[Float[Array, "h w 3"], Bool[Array, "h w"]]:
+    points: Float[np.ndarray, "h w 3"], valid: Bool[np.ndarray, "h w"]
+) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
     """Mean of the unit normals of the four corners that a pixel makes with its direct neighbours.
 
     Returns:
         Unit normals in the frame of the points, towards the camera, zero without a corner; whether there is one.
     """
-    points = jnp.where(valid[..., None], points, 0.0)
-    _, up, _, left, _, right, _, down, _ = (other - points for other in _around(points, 0.0))
-    _, has_up, _, has_left, _, has_right, _, has_down, _ = _around(valid, False)
-    total, has_any = jnp.zeros_like(points), jnp.zeros_like(valid)
-    for a, b, has_a, has_b in (
-        (up, left, has_up, has_left),
-        (left, down, has_left, has_down),
-        (down, right, has_down, has_right),
-        (right, up, has_right, has_up),
-    ):
+    beside = (-1, 0), (0, -1), (1, 0), (0, 1), (-1, 0)
+    sides = [other - points for other in _shifted(points, beside, "constant")]
+    is_there = _shifted(valid, beside, "constant")
+    total, has_any = np.zeros_like(points), np.zeros_like(valid)
+    for a, b, has_a, has_b in zip(sides, sides[1:], is_there, is_there[1:], strict=False):
         has_corner = valid & has_a & has_b
-        total += jnp.where(has_corner[..., None], safe_normalize(jnp.cross(a, b)), 0.0)
+        total += np.where(has_corner[..., None], _unit(np.cross(a, b)), 0)
         has_any |= has_corner
-    return jnp.where(has_any[..., None], safe_normalize(total), 0.0), has_any
+    return _unit(total), has_any
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / (np.linalg.norm(vectors, axis=-1, keepdims=True) + 1e-12)
 
 
 def normal_edges(
-    normals: Float[Array, "h w 3"], has_normal: Bool[Array, "h w"], max_degrees: Float[Array, ""]
-) -> Bool[Array, "h w"]:
+    points: Float[np.ndarray, "h w 3"], valid: Bool[np.ndarray, "h w"], max_degrees: float
+) -> Bool[np.ndarray, "h w"]:
     """Mark pixels with a normal edge in their 3 × 3 surroundings: an angle above `max_degrees` to a neighbour's normal.
 
     A pixel without a normal differs from any neighbour that has one.
     """
-    cosines = [jnp.sum(normals * other, axis=-1) for other in _around(normals, None)]
-    smallest = jnp.ones_like(normals[..., 0])
-    for cosine, is_there in zip(cosines, _around(has_normal, None), strict=True):
-        smallest = jnp.minimum(smallest, jnp.where(is_there, cosine, 1.0))
-    is_edge = smallest < jnp.cos(jnp.deg2rad(jnp.minimum(max_degrees, 180.0)))
-    return jnp.any(jnp.stack(_around(is_edge, False)), axis=0)
+    normals, has_normal = grid_normals(points, valid)
+    around = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
+    smallest = np.ones(valid.shape)
+    for other, is_there in zip(*(_shifted(of, around, "edge") for of in (normals, has_normal)), strict=True):
+        smallest = np.where(is_there, np.minimum(smallest, np.sum(normals * other, axis=-1)), smallest)
+    is_edge = smallest < math.cos(math.radians(min(max_degrees, 180)))
+    return cv2.dilate(is_edge.astype(np.uint8), SQUARE) > 0
 
 
 def depth_edges(
-    depth: Float[Array, "h w"], valid: Bool[Array, "h w"], max_step: Float[Array, ""]
-) -> Bool[Array, "h w"]:
+    depth: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"], max_step: float
+) -> Bool[np.ndarray, "h w"]:
     """Mark valid pixels whose valid 3 × 3 neighbours range in depth over more than `max_step` of the pixel's own."""
-    highest = jnp.max(jnp.stack(_around(jnp.where(valid, depth, -jnp.inf), -jnp.inf)), axis=0)
-    lowest = jnp.min(jnp.stack(_around(jnp.where(valid, depth, jnp.inf), jnp.inf)), axis=0)
-    return valid & ((highest - lowest) / jnp.where(valid, depth, 1.0) > max_step)
+    highest, lowest = (sign * cv2.dilate(np.where(valid, sign * depth, -np.inf), SQUARE) for sign in (1, -1))
+    return valid & (np.subtract(highest, lowest, out=np.zeros_like(highest), where=valid) > max_step * depth)
 
 
-def above_percentile(confidence: Float[Array, "h w"], percentile: Float[Array, ""]) -> Bool[Array, "h w"]:
-    """Mark pixels with a confidence above a percentile of their view, or the highest: a constant one is never low.
-
-    All pixels for percentile 0.
-    """
-    is_above = confidence > jnp.quantile(confidence, percentile / 100.0)
-    return is_above | (confidence >= jnp.max(confidence)) | (percentile <= 0)
-
-
-@full_precision
-def usable(
-    points: Float[Array, "h w 3"],
-    confidence: Float[Array, "h w"],
-    is_clear: Bool[Array, "h w"],
+def consistent(
+    row: int,
+    depths: Float[np.ndarray, "v h w"],
+    intrinsics: Float[np.ndarray, "v 3 3"],
+    T_anchor_view: Float[np.ndarray, "v 4 4"],
     config: MaskConfig,
-) -> Bool[Array, "h w"]:
-    """The mask of one view by itself.
+) -> Bool[np.ndarray, "h w"]:
+    """Mark the pixels of view `row` whose depth enough of the other views that see the point have at the nearest pixel.
+
+    A pixel that no other view sees is not contradicted.
 
     Args:
-        points: camera frame, metres.
-        confidence: higher is better.
-        is_clear: what the network does not call ambiguous.
-    """
-    valid = jnp.all(jnp.isfinite(points), axis=-1) & (points[..., 2] > 0) & jnp.isfinite(confidence)
-    confidence = jnp.where(jnp.isfinite(confidence), confidence, 0.0)
-    valid &= is_clear | (config.drop_ambiguous <= 0)
-    valid &= above_percentile(confidence, config.confidence_percentile)
-    points = jnp.where(valid[..., None], points, 0.0)
-    is_edge = normal_edges(*grid_normals(points, valid), config.max_edge_degrees)
-    return valid & ~(is_edge & depth_edges(points[..., 2], valid, config.max_edge_step))
-
-
-def consistent_share(
-    row: Int[Array, ""],
-    depths: Float[Array, "v h w"],
-    intrinsics: Float[Array, "v 3 3"],
-    T_anchor_view: Float[Array, "v 4 4"],
-    config: MaskConfig,
-) -> tuple[Float[Array, "h w"], Int[Array, "h w"]]:
-    """Compute the share of the other views seeing a point of view `row` that have its depth at the nearest pixel.
-
-    Args:
-        row: the view whose points are tested.
         depths: camera-space z in metres of all views; 0 where there is none.
         intrinsics: of all views, pixel centres at integers.
         T_anchor_view: camera -> any common frame.
-
-    Returns:
-        The share, 0 where no view sees the point; and how many views see it and have a depth there.
     """
-    _, height, width = depths.shape
-    y, x = jnp.meshgrid(jnp.arange(height, dtype=jnp.float32), jnp.arange(width, dtype=jnp.float32), indexing="ij")
-    pixels = jnp.stack([x, y, jnp.ones_like(x)], axis=-1)
-    points = depths[row][..., None] * (pixels @ jnp.linalg.inv(intrinsics[row]).T)
-    T_view_row = jnp.linalg.inv(T_anchor_view) @ T_anchor_view[row]
-    moved = jnp.einsum("vij,hwj->vhwi", T_view_row[:, :3, :3], points) + T_view_row[:, None, None, :3, 3]
-    expected = moved[..., 2]
-    is_before = expected > NEAREST_DEPTH
-    projected = jnp.einsum("vij,vhwj->vhwi", intrinsics, moved / jnp.where(is_before, expected, 1.0)[..., None])
-    u, v = projected[..., 0], projected[..., 1]
-    sees = is_before & (u >= 0) & (u <= width - 1) & (v >= 0) & (v <= height - 1) & (depths[row] > 0)
-    sees &= (jnp.arange(len(depths)) != row)[:, None, None]
-    column, line = (jnp.round(jnp.where(sees, c, 0.0)).astype(jnp.int32) for c in (u, v))
-    found = depths[jnp.arange(len(depths))[:, None, None], line, column]
-    sees &= found > 0
-    tolerance = config.consistent_depth_m + config.consistent_depth_share * expected
-    agrees = sees & (jnp.abs(expected - found) < tolerance)
-    num_seen = jnp.sum(sees, axis=0)
-    return jnp.sum(agrees, axis=0) / jnp.maximum(num_seen, 1).astype(jnp.float32), num_seen
-
-
-@full_precision
-def consistent(
-    row: Int[Array, ""],
-    depths: Float[Array, "v h w"],
-    intrinsics: Float[Array, "v 3 3"],
-    T_anchor_view: Float[Array, "v 4 4"],
-    config: MaskConfig,
-) -> Bool[Array, "h w"]:
-    """Mark the pixels of view `row` that enough views agree with; one that no other view sees is not contradicted."""
-    share, num_seen = consistent_share(row, depths, intrinsics, T_anchor_view, config)
-    return (num_seen == 0) | (share >= config.min_consistent_share)
+    height, width = depths.shape[1:]
+    v, u = np.indices((height, width))
+    points = depths[row][..., None] * (np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(intrinsics[row]).T)
+    num_seen, num_agreed = np.zeros((2, height, width), int)
+    for other in set(range(len(depths))) - {row}:
+        T = np.linalg.inv(T_anchor_view[other]) @ T_anchor_view[row]
+        moved = points @ T[:3, :3].T + T[:3, 3]
+        expected = moved[..., 2]
+        sees = (expected > NEAREST_DEPTH) & (depths[row] > 0)
+        pixels = (moved / np.where(sees, expected, 1)[..., None]) @ intrinsics[other].T
+        x, y = pixels[..., 0], pixels[..., 1]
+        sees &= (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
+        found = depths[other][tuple(np.rint(np.where(sees, c, 0)).astype(int) for c in (y, x))]
+        sees &= found > 0
+        num_seen += sees
+        tolerance = config.consistent_depth_m + config.consistent_depth_share * expected
+        num_agreed += sees & (np.abs(expected - found) < tolerance)
+    return num_agreed >= config.min_consistent_share * num_seen

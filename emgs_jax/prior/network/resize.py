@@ -73,24 +73,15 @@ def resize_image(image: UInt8[np.ndarray, "h w 3"], resize: Resize) -> UInt8[np.
     return np.asarray(Image.fromarray(image).resize(resize.scaled, method))[top : top + height, left : left + width]
 
 
-def frame_on_grid(resize: Resize) -> tuple[Float[np.ndarray, " w"], Float[np.ndarray, " h"]]:
+def on_grid_of(
+    frame: Size, scaled: Sequence[float], corner: Sequence[float]
+) -> tuple[Float[np.ndarray, " w"], Float[np.ndarray, " h"]]:
     """Grid column of every column of the frame, grid row of every row; not whole, and beyond the grid where cropped."""
     columns, rows = (
-        (np.arange(size) + 0.5) * (scaled / size) - 0.5 - corner
-        for size, scaled, corner in zip(resize.frame, resize.scaled, resize.corner, strict=True)
+        (np.arange(size) + 0.5) * (length / size) - 0.5 - start
+        for size, length, start in zip(frame, scaled, corner, strict=True)
     )
     return columns, rows
-
-
-def to_frame(
-    points: Float32[np.ndarray, "gh gw 3"],
-    confidence: Float32[np.ndarray, "gh gw"],
-    mask: Bool[np.ndarray, "gh gw"],
-    resize: Resize,
-    max_depth_step: float,
-) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Points, confidence and mask of a view at every pixel of its frame, see `at_pixels`."""
-    return at_pixels(points, confidence, mask, frame_on_grid(resize), max_depth_step)
 
 
 def at_pixels(

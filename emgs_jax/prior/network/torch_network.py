@@ -1,25 +1,151 @@
-"""A network of the MapAnything framework in torch: arrays in, arrays out, in the precision that was asked for."""
+"""Networks of the MapAnything framework in torch: arrays in, arrays out, in the precision that was asked for.
+
+Nothing is downloaded, and no parameter keeps a random value. torch and the framework are imported in functions. What
+fails is one message with the file or package and the remedy.
+"""
 
 import contextlib
+import hashlib
+import importlib
+import os
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
 import numpy as np
 
-from emgs_jax.io.packages import best_device
+from emgs_jax.features.checkpoint import BACKBONE, digest
+from emgs_jax.io.packages import best_device, companion_problem, first_line
 from emgs_jax.prior.network.framework import (
+    DOWNLOAD,
     MODELS,
     USED_OUTPUTS,
+    ComputeConfig,
     Network,
-    NetworkSettings,
     NoAnswerError,
     View,
     check_checkpoint,
 )
-from emgs_jax.prior.network.loading import configured, digest, import_framework, offline, pretrained
+
+CLONE = "the clone of facebookresearch/map-anything"
+
+
+def import_framework(name: str) -> ModuleType:
+    """A module of torch or of the framework; ValueError with the commands that install it."""
+    try:
+        return importlib.import_module(name)
+    except Exception as error:
+        problem = companion_problem() if name != "torch" else None
+        if problem is not None:
+            raise ValueError(f"prior=mapanything cannot import {name}: {problem}") from error
+        if not isinstance(error, ImportError):
+            raise
+        raise ValueError(
+            f"prior=mapanything needs torch and the package mapanything, but {error}: in a clone of this repository, "
+            'pip install -e ".[mapanything]"; then clone the GitHub repository facebookresearch/map-anything and in '
+            "it, pip install --no-deps -e . (it is in no package index); or record with experiments.predict where both "
+            "are installed and use prior=recorded here"
+        ) from error
+
+
+def pretrained(folder: Path) -> Any:
+    """MapAnything with the weights of a checkpoint; ValueError where they are damaged or not exactly its own."""
+    models, safetensors = import_framework("mapanything.models"), import_framework("safetensors")
+    try:
+        return models.MapAnything.from_pretrained(str(folder), strict=True)
+    except (safetensors.SafetensorError, RuntimeError) as error:  # a line for each parameter
+        said = " ".join(str(error).split())[:500]
+        raise ValueError(
+            f"{folder / 'model.safetensors'} is damaged or no MapAnything's ({said}): repeat {DOWNLOAD}"
+        ) from error
+
+
+def configured(torch: ModuleType, name: str, device: str) -> Any:
+    """A network that the framework composes from its own configuration, whose files must be in the caches already."""
+    from hydra.core.global_hydra import GlobalHydra
+
+    models, known = import_framework("mapanything.models"), MODELS[name]
+    outer = GlobalHydra.instance().hydra  # the framework composes with Hydra too and would leave its own behind
+    try:
+        with whole_weights(torch):
+            return models.init_model_from_config(name, device=device).eval()
+    except torch.cuda.OutOfMemoryError:
+        raise
+    except ImportError as error:
+        install = f"in {CLONE}, pip install -e '.{f'[{known.extra}]' if known.extra else ''}'"
+        raise ValueError(f"prior.model={name} needs more ({error}): {companion_problem() or install}") from error
+    except Exception as error:  # each format of weights has its own types of errors
+        raise ValueError(
+            f"prior.model={name} cannot be made ({first_line(error)}). Nothing is downloaded at run time: its weights "
+            f"({known.weights}) must be whole in the local caches (HF_HOME, TORCH_HOME), or where "
+            f"root_pretrained_checkpoints_dir in configs/machine/default.yaml in {CLONE} says"
+        ) from error
+    finally:
+        GlobalHydra.instance().hydra = outer
+
+
+@contextlib.contextmanager
+def whole_weights(torch: ModuleType) -> Iterator[None]:
+    """Refuse weights that leave a parameter as it was drawn: some wrappers load without being strict."""
+    module = torch.nn.Module
+    load = module.load_state_dict
+
+    def load_whole(self: Any, state: Any, strict: bool = True, assign: bool = False) -> Any:
+        result, tensors = load(self, state, strict, assign), self.state_dict()
+        loaded = {tensor.data_ptr() for name, tensor in tensors.items() if name in state}  # of two names files have one
+        missing = [
+            name for name in result.missing_keys if name not in tensors or tensors[name].data_ptr() not in loaded
+        ]
+        if missing:
+            raise ValueError(f"{type(self).__name__} lacks {len(missing)} of its weights, {', '.join(missing[:3])}, …")
+        return result
+
+    module.load_state_dict = load_whole
+    try:
+        yield
+    finally:
+        module.load_state_dict = load
+
+
+@contextlib.contextmanager
+def offline(torch: ModuleType) -> Iterator[None]:
+    """Let nothing be downloaded: the Hugging Face hub by its switch, torch.hub by loading from its cached clones."""
+    os.environ["HF_HUB_OFFLINE"] = os.environ["TRANSFORMERS_OFFLINE"] = "1"
+    with contextlib.suppress(ImportError):
+        constants = importlib.import_module("huggingface_hub.constants")
+        constants.HF_HUB_OFFLINE = True  # it has read the variable if something imported it before
+    hub = torch.hub
+    load, download = hub.load, hub.download_url_to_file
+
+    def load_cached(repository: str, *arguments: Any, source: str = "github", **options: Any) -> Any:
+        if source == "github":
+            repository = str(_cached_clone(repository, Path(hub.get_dir())))
+        return load(repository, *arguments, source="local", **options)
+
+    def refuse(url: str, target: str, *arguments: Any, **options: Any) -> None:
+        raise OSError(f"{target} is missing, and nothing is downloaded at run time: it belongs to {url}")
+
+    hub.load, hub.download_url_to_file = load_cached, refuse
+    try:
+        yield
+    finally:
+        hub.load, hub.download_url_to_file = load, download
+
+
+def _cached_clone(repository: str, hub: Path) -> Path:
+    """torch.hub's copy of a repository `owner/name[:reference]`."""
+    name, _, reference = repository.partition(":")
+    clones = [
+        hub / f"{name.replace('/', '_')}_{branch}" for branch in ([reference] if reference else ["main", "master"])
+    ]
+    for clone in clones:
+        if (clone / "hubconf.py").is_file():
+            return clone
+    raise OSError(f"{clones[0]} has no hubconf.py: clone the GitHub repository {name} into that folder once")
+
 
 Call = Callable[[list[View]], list[View]]
 
@@ -66,49 +192,41 @@ def _array(value: Any) -> Any:
     return (value.float() if value.is_floating_point() else value).numpy()
 
 
-def load_network(settings: NetworkSettings) -> Network:
-    """Load a network from local files; ValueError naming what is not installed, missing or set wrongly."""
-    torch, model = import_framework("torch"), MODELS[settings.model]
+def load_network(name: str, checkpoint: Path | None, compute: ComputeConfig) -> Network:
+    """Load a network from local files; ValueError naming what is not installed, missing or set wrongly.
+
+    Args:
+        name: key of `MODELS`.
+        checkpoint: folder of the weights, of `mapanything` only.
+    """
+    torch, model = import_framework("torch"), MODELS[name]
     import_framework("torch.hub")
-    device = _device(torch, settings)
-    if model.needs_gpu and not device.startswith("cuda"):
-        raise ValueError(f"prior.model={settings.model} cannot be built without a GPU: use prior.model=mapanything")
-    amp = settings.compute.amp if device.startswith("cuda") and model.precision else "float32"
-    described = {"device": device.partition(":")[0], "amp": amp}
-    torch.backends.cudnn.benchmark, torch.backends.cudnn.deterministic = False, True
-    with offline(torch), _memory_error(torch, f"the weights of {settings.model}"):
-        if model.is_conditioned:
-            check_checkpoint(settings.checkpoint, Path(torch.hub.get_dir()))
-            described["checkpoint_sha256"] = digest(settings.checkpoint)
-            network = pretrained(torch, settings.checkpoint).to(device).eval()
-            call = _conditioned_call(network, settings, amp)
-        else:
-            network = configured(torch, settings.model, device)
-            _set_precision(torch, network, settings.model, amp)
-            call = _plain_call(network)
-    return TorchNetwork(call, device, described)
-
-
-def _device(torch: ModuleType, settings: NetworkSettings) -> str:
-    """The device that is asked for, or the one there is; ValueError where it is asked for and not there."""
-    device = settings.compute.device or best_device(torch, f"prior.model={settings.model}", "prior.compute.device")
+    device = compute.device or best_device(torch, f"prior.model={name}", "prior.compute.device")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(f"prior.compute.device={device}, but torch {torch.__version__} finds no GPU: use cpu or null")
-    return device
-
-
-def _conditioned_call(model: Any, settings: NetworkSettings, amp: str) -> Call:
-    def call(views: list[View]) -> list[View]:
-        return model.infer(
-            views,
-            memory_efficient_inference=settings.compute.memory_efficient,
-            minibatch_size=settings.compute.minibatch_size,
-            use_amp=amp != "float32",
-            amp_dtype="fp16" if amp == "fp16" else "bf16",
-            apply_mask=False,  # upstream masks every view in NumPy; prior/masks.py does it for those in use
-        )
-
-    return call
+    if model.needs_gpu and not device.startswith("cuda"):
+        raise ValueError(f"prior.model={name} cannot be built without a GPU: use prior.model=mapanything")
+    amp = compute.amp if device.startswith("cuda") and model.precision else "float32"
+    described = {"device": device.partition(":")[0], "amp": amp}
+    torch.backends.cudnn.benchmark, torch.backends.cudnn.deterministic = False, True
+    with offline(torch), _memory_error(torch, f"the weights of {name}"):
+        if model.is_conditioned:
+            check_checkpoint(checkpoint, Path(torch.hub.get_dir()))
+            digests = "".join(digest(checkpoint / name) for name in BACKBONE)
+            described["checkpoint_sha256"] = hashlib.sha256(digests.encode()).hexdigest()
+            call = partial(
+                pretrained(checkpoint).to(device).eval().infer,
+                memory_efficient_inference=compute.memory_efficient,
+                minibatch_size=compute.minibatch_size,
+                use_amp=amp != "float32",
+                amp_dtype="fp16" if amp == "fp16" else "bf16",
+                apply_mask=False,  # upstream masks every view; masks.py does it for those in use
+            )
+        else:
+            network = configured(torch, name, device)
+            _set_precision(torch, network, name, amp)
+            call = _plain_call(network)
+    return TorchNetwork(call, device, described)
 
 
 def _set_precision(torch: ModuleType, model: Any, name: str, amp: str) -> None:

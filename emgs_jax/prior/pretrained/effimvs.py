@@ -8,6 +8,7 @@ from finer features and what the coarser ones said. Depths are numbers from 0 (f
 so the unit of poses and range does not matter.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -24,15 +25,17 @@ from emgs_jax.prior.pretrained.matching import (
     FINEST,
     MIDDLE,
     Features,
-    Gru,
-    Sources,
     correlation,
+    inverse_between,
+    pyramid,
     seen_from,
     turn,
     upsample,
 )
-from emgs_jax.prior.pretrained.weights import Tensors, conv
+from emgs_jax.prior.pretrained.weights import Layers, Tensors, layers, read_layers
+from emgs_jax.prior.sources import Sources
 
+BLOCKS = (2, 3, 3, 3)  # convolutions at each scale of the features, whose first one halves it, but for the first scale
 SOURCE = "https://github.com/bdwsq1996/Effi-MVS-plus (no licence stated), checkpoints/Effi_MVS_plus/model_tank.ckpt"
 
 
@@ -53,47 +56,6 @@ class EffiMVSConfig(eqx.Module):
     num_iterations: int = static(low=1, high=64)
 
 
-class FeatureNet(eqx.Module):
-    """Features at three scales: down by `blocks`, each of which but the first halves, and up by `lateral` and `out`."""
-
-    blocks: tuple[tuple[Conv, ...], ...]
-    lateral: tuple[Conv, ...]
-    out: tuple[Conv, ...]
-
-
-class Propagation(eqx.Module):
-    """From a volume at one scale and what was made of it at the coarser one to the same at this."""
-
-    current: Conv
-    coarser: Conv
-    both: Conv
-    up: Conv
-
-
-class Update(eqx.Module):
-    """What a GRU reads, the unit itself, by how much its state moves the depth, and how that is doubled."""
-
-    volumes: tuple[Conv, ...]
-    depth: tuple[Conv, ...]
-    mixed: Conv
-    seen: Conv
-    gru: Gru
-    step: tuple[Conv, ...]
-    upsampling: tuple[Conv, ...]
-
-
-class EffiMVS(eqx.Module):
-    """Weights of the whole network; of tuples of two or three the coarsest scale is first."""
-
-    features: FeatureNet
-    context: FeatureNet
-    visibility: tuple[Conv, ...]
-    regularization: tuple[Conv, ...]
-    of_scores: tuple[Propagation, ...]
-    of_fits: tuple[Propagation, ...]
-    updates: tuple[Update, ...]
-
-
 class Seen(NamedTuple):
     """What is kept of an image: features that are matched, and those that a GRU of this view begins with."""
 
@@ -109,7 +71,7 @@ class _Volumes(NamedTuple):
     ends: tuple[Array, Array]
 
 
-def _relu_chain(image: Array, convs: tuple[Conv, ...]) -> Array:
+def _relu_chain(image: Array, convs: Sequence[Conv]) -> Array:
     return jax.nn.relu(chain(image, convs))
 
 
@@ -118,26 +80,23 @@ def _repeat(image: Float[Array, "h w *c"]) -> Float[Array, "h2 w2 *c"]:
 
 
 @full_precision
-def extract(network: EffiMVS, image: Float[Array, "h w 3"]) -> Seen:
+def extract(network: Layers, image: Float[Array, "h w 3"]) -> Seen:
     """Features of an RGB image in [0, 1] whose height and width are multiples of 32."""
-    return Seen(_features(network.features, image), _features(network.context, image))
 
+    def features(name: str) -> Features:
+        scale, scales = image, []
+        for level, count in enumerate(BLOCKS):
+            scale = _relu_chain(scale, layers(network, f"{name}.conv{level}", range(count)))
+            scales.append(scale)
+        lateral, out = (layers(network, name, names) for names in (("inner1", "inner2"), ("out3", "out2", "out1")))
+        return pyramid(scales[1:], lateral, out, _repeat)
 
-def _features(network: FeatureNet, image: Float[Array, "h w 3"]) -> Features:
-    scales = []
-    for block in network.blocks:
-        image = _relu_chain(image, block)
-        scales.append(image)
-    _, half, quarter, eighth = scales
-    middle = _repeat(eighth) + convolve(quarter, network.lateral[0])
-    finest = _repeat(middle) + convolve(half, network.lateral[1])
-    return Features(*(convolve(image, out) for image, out in zip((finest, middle, eighth), network.out, strict=True)))
+    return Seen(features("feature"), features("cnet_depth"))
 
 
 def _inverse(unit: Array, depth_range: Float[Array, "2"]) -> Array:
-    """0 (farthest) to 1 (nearest) -> 1/z, which stays above 0 beyond the farthest."""
-    near, far = 1.0 / depth_range[0], 1.0 / depth_range[1]
-    return jnp.maximum(far + unit * (near - far), 1e-4 * far)
+    """`inverse_between`, which stays above 0 beyond the farthest."""
+    return jnp.maximum(inverse_between(unit, depth_range), 1e-4 * (1.0 / depth_range[1]))
 
 
 def _unit(depth: Array, depth_range: Float[Array, "2"]) -> Array:
@@ -150,7 +109,7 @@ def _correlations(
     sources: Sources,
     of_source: tuple[Float[Array, "s h2 w2 c"], Camera],
     depths: Float[Array, "n h w"],
-    weigh: tuple[Conv, ...] | Float[Array, "s h w"],
+    weigh: list[Conv] | Float[Array, "s h w"],
 ) -> tuple[Float[Array, "n h w"], Float[Array, "s h w"]]:
     """How well depths fit, the mean over the sources by how far each shows each pixel, and those weights.
 
@@ -167,33 +126,37 @@ def _correlations(
     def add(total: tuple[Array, Array], given: tuple[Sources, Array, Array]) -> tuple[tuple[Array, Array], Array]:
         source, feature, weight = given
         found = correlation(reference, feature, seen_from(points, source), camera, 1)[..., 0]
-        if isinstance(weigh, tuple):
+        if isinstance(weigh, list):
             share = jax.nn.softmax(found, axis=0)
             entropy = -jnp.sum(share * jnp.log(share + 1e-7), axis=0)
             weight = jax.nn.sigmoid(chain(entropy[..., None], weigh)[..., 0]) * source.is_used
         return (total[0] + weight * found, total[1] + weight), weight
 
-    given = jnp.zeros((len(features), *depths.shape[1:])) if isinstance(weigh, tuple) else weigh
+    given = jnp.zeros((len(features), *depths.shape[1:])) if isinstance(weigh, list) else weigh
     empty = jnp.zeros_like(depths), jnp.zeros(depths.shape[1:])
     (total, weights), each = jax.lax.scan(add, empty, (sources, features, given))
     return total / (weights + 1e-6), each
 
 
-def _regularize(fits: Float[Array, "d h w"], convs: tuple[Conv, ...]) -> Float[Array, "d h w"]:
+def _regularize(fits: Float[Array, "d h w"], network: Layers) -> Float[Array, "d h w"]:
     """The scores of the first volume: down twice, up twice, with what was there added."""
+    convs = layers(network, "cost_regularization", [f"conv{number}" for number in range(8)])
     full = _relu_chain(fits[..., None], convs[:2])
     half = _relu_chain(full, convs[2:4])
     quarter = _relu_chain(half, convs[4:6])
     half = half + jax.nn.relu(convolve(quarter, convs[6]))
-    return convolve(full + jax.nn.relu(convolve(half, convs[7])), convs[8])[..., 0]
+    full = full + jax.nn.relu(convolve(half, convs[7]))
+    return convolve(full, network["cost_regularization.prob"])[..., 0]
 
 
 def _propagate(
-    fits: Float[Array, "d h w"], coarser: Float[Array, "d h2 w2"], network: Propagation
+    fits: Float[Array, "d h w"], coarser: Float[Array, "d h2 w2"], network: Layers, name: str
 ) -> Float[Array, "d h w"]:
-    found = (jax.nn.relu(convolve(fits[..., None], network.current)), coarser[..., None])
-    both = jnp.concatenate([found[0], jax.nn.relu(convolve(found[1], network.coarser))], axis=-1)
-    return _relu_chain(both, (network.both, network.up))[..., 0]
+    """From a volume at one scale and what was made of it at the coarser one to the same at this."""
+    found = jax.nn.relu(convolve(fits[..., None], network[f"{name}.conv0"]))
+    beside = jax.nn.relu(convolve(coarser[..., None], network[f"{name}.conv_cost"]))
+    both = jnp.concatenate([found, beside], axis=-1)
+    return _relu_chain(both, layers(network, name, ("conv1", "conv2")))[..., 0]
 
 
 def _read(volume: Float[Array, "d h w"], ends: tuple[Array, Array], units: Float[Array, "n h w"]) -> Array:
@@ -218,34 +181,38 @@ def _refine(
     unit: Float[Array, "h w"],
     context: Float[Array, "h w c"],
     volumes: _Volumes,
-    network: Update,
+    network: Layers,
+    name: str,
     step: float,
     num_iterations: int,
 ) -> Float[Array, "h2 w2"]:
     """Depth at twice the size, after the GRU has moved it."""
-    size = network.gru.update.bias.shape[0]
+    gates = layers(network, f"{name}.depth_gru", ("convz", "convr", "convq"))
+    size = gates[0].bias.shape[0]
     hidden, context = jnp.tanh(context[..., :size]), jax.nn.relu(context[..., size:])
 
     def iterate(state: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], None]:
         hidden, unit = state
         tried = _around(unit, step, 3)
         read = [jnp.moveaxis(_read(volume, volumes.ends, tried), 0, -1) for volume in (volumes.fits, volumes.scores)]
-        found = (
-            _relu_chain(jnp.concatenate(read, axis=-1), network.volumes),
-            _relu_chain(unit[..., None], network.depth),
-        )
-        mixed = convolve(jnp.concatenate(found, axis=-1), network.mixed)
-        seen = jax.nn.relu(convolve(jnp.concatenate([mixed, context], axis=-1), network.seen))
-        hidden = turn(hidden, seen, network.gru)
-        return (hidden, unit + jnp.tanh(chain(hidden, network.step)[..., 0])), None
+        given = {"c": jnp.concatenate(read, axis=-1), "d": unit[..., None]}
+        found = [
+            _relu_chain(image, layers(network, f"{name}.encoder", (f"conv{kind}1", f"conv{kind}2")))
+            for kind, image in given.items()
+        ]
+        mixed = convolve(jnp.concatenate(found, axis=-1), network[f"{name}.encoder.convd"])
+        seen = convolve(jnp.concatenate([mixed, context], axis=-1), network[f"{name}.encoder.convc"])
+        hidden = turn(hidden, jax.nn.relu(seen), gates)
+        moved = jnp.tanh(chain(hidden, layers(network, f"{name}.depth_head", ("conv1", "conv2")))[..., 0])
+        return (hidden, unit + moved), None
 
     (hidden, unit), _ = jax.lax.scan(iterate, (hidden, unit), length=num_iterations)
-    return upsample(unit, 0.25 * chain(hidden, network.upsampling), "constant")
+    return upsample(unit, 0.25 * chain(hidden, layers(network, f"{name}.mask", (0, 2))), "constant")
 
 
 @full_precision
 def estimate(
-    network: EffiMVS,
+    network: Layers,
     reference: Seen,
     sources: Sources,
     depth_range: Float[Array, "2"],
@@ -257,22 +224,22 @@ def estimate(
     Without a source that counts both mean nothing.
 
     Args:
-        reference: what is kept of the view.
-        sources: the others, with what is kept of them as features.
+        reference: what is kept of the view, and of the sources.
         depth_range: nearest and farthest depth.
         camera: of all images; width and height are multiples of 32.
     """
     # The coarsest scale is first.
-    own, others, contexts = (kept[::-1] for kept in (reference.features, sources.features.features, reference.context))
+    own, others, contexts = (kept[::-1] for kept in (reference.features, sources.views.features, reference.context))
     cameras = [downscale(camera, scale) for scale in (COARSEST, MIDDLE, FINEST)]
-    sources = sources._replace(features=())
+    sources = sources._replace(views=())
     units = jnp.linspace(0.0, 1.0, config.num_initial)
     depths = jnp.broadcast_to(1.0 / _inverse(units, depth_range)[:, None, None], (len(units), *own[0].shape[:2]))
-    fits, weights = _correlations(own[0], sources, (others[0], cameras[0]), depths, network.visibility)
-    volumes = _Volumes(fits, _regularize(fits, network.regularization), (units[0], units[-1]))
+    visibility = layers(network, "PixelwiseNet", range(4))
+    fits, weights = _correlations(own[0], sources, (others[0], cameras[0]), depths, visibility)
+    volumes = _Volumes(fits, _regularize(fits, network), (units[0], units[-1]))
     share = jax.nn.softmax(volumes.scores, axis=0)
     unit = _unit(jnp.sum(share * depths, axis=0), depth_range)
-    for scale, update in enumerate(network.updates):
+    for scale in range(3):
         step = 2.0 ** (2 - scale) / config.num_steps
         if scale > 0:
             tried = _around(unit, step * (config.num_around // 2), config.num_around)
@@ -280,10 +247,11 @@ def estimate(
             depths = 1.0 / _inverse(tried, depth_range)
             fits, _ = _correlations(own[scale], sources, (others[scale], cameras[scale]), depths, weights)
             coarser = [_read(v, volumes.ends, tried[:, ::2, ::2]) for v in (volumes.fits, volumes.scores)]
-            networks = network.of_fits[scale - 1], network.of_scores[scale - 1]
-            made = [_propagate(fits, *given) for given in zip(coarser, networks, strict=True)]
+            names = f"CSP_C{scale}", f"CSP_R{scale}"
+            made = [_propagate(fits, volume, network, name) for volume, name in zip(coarser, names, strict=True)]
             volumes = _Volumes(*made, (tried[0], tried[-1]))
-        unit = _refine(unit, contexts[scale], volumes, update, step, config.num_iterations)
+        name = f"update_block_depth{scale + 1}"
+        unit = _refine(unit, contexts[scale], volumes, network, name, step, config.num_iterations)
     depth = 1.0 / _inverse(unit, depth_range)
     confidence = jax.image.resize(_confidence(share), depth.shape, "linear", antialias=False)
     return depth, confidence
@@ -298,57 +266,21 @@ def _confidence(share: Float[Array, "d h w"]) -> Float[Array, "h w"]:
     return jnp.sum(jnp.where((around >= 0) & (around <= last), found, 0.0), axis=0)
 
 
-def build_network(tensors: Tensors) -> EffiMVS:
+def build_network(tensors: Tensors) -> Layers:
     """The network of tensors that are named as in the published file; KeyError names one that is missing."""
-    part = tensors
-    weighing = tuple(_normalised(part, f"PixelwiseNet.{number}") for number in range(3))
-    strides, name = (1, 1, 2, 1, 2, 1), "cost_regularization"
-    down = tuple(_normalised(part, f"{name}.conv{number}", stride) for number, stride in enumerate(strides))
-    up = tuple(_normalised(part, f"{name}.conv{number}", expansion=2) for number in (6, 7))
-    return EffiMVS(
-        features=_feature_net(part, "feature"),
-        context=_feature_net(part, "cnet_depth"),
-        visibility=(*weighing, conv(part, "PixelwiseNet.3")),
-        regularization=(*down, *up, conv(part, f"{name}.prob")),
-        of_scores=tuple(_propagation(part, f"CSP_R{scale}") for scale in (1, 2)),
-        of_fits=tuple(_propagation(part, f"CSP_C{scale}") for scale in (1, 2)),
-        updates=tuple(_update(part, f"update_block_depth{scale}") for scale in (1, 2, 3)),
-    )
-
-
-def _normalised(
-    part: Tensors, name: str, stride: int | tuple[int, ...] = 1, expansion: int | tuple[int, ...] = 1
-) -> Conv:
-    return conv(part, f"{name}.conv", f"{name}.bn", stride, 1, expansion)
-
-
-def _feature_net(part: Tensors, name: str) -> FeatureNet:
-    blocks = [
-        tuple(_normalised(part, f"{name}.conv{level}.{n}", 2 if level > 0 and n == 0 else 1) for n in range(count))
-        for level, count in enumerate((2, 3, 3, 3))
-    ]
-    lateral, out = ("inner1", "inner2"), ("out3", "out2", "out1")
-    return FeatureNet(tuple(blocks), *(tuple(conv(part, f"{name}.{n}") for n in names) for names in (lateral, out)))
-
-
-def _propagation(part: Tensors, name: str) -> Propagation:
-    return Propagation(
-        _normalised(part, f"{name}.conv0", (1, 2, 2)),
-        _normalised(part, f"{name}.conv_cost"),
-        _normalised(part, f"{name}.conv1"),
-        _normalised(part, f"{name}.conv2", expansion=(1, 2, 2)),
-    )
-
-
-def _update(part: Tensors, name: str) -> Update:
-    def convs(*names: str) -> tuple[Conv, ...]:
-        return tuple(conv(part, f"{name}.{each}") for each in names)
-
-    return Update(
-        convs("encoder.convc1", "encoder.convc2"),
-        convs("encoder.convd1", "encoder.convd2"),
-        *convs("encoder.convd", "encoder.convc"),
-        Gru(*convs("depth_gru.convz", "depth_gru.convr", "depth_gru.convq")),
-        convs("depth_head.conv1", "depth_head.conv2"),
-        convs("mask.0", "mask.2"),
-    )
+    plain, told = ["PixelwiseNet.3", "cost_regularization.prob"], {}
+    for name in ("feature", "cnet_depth"):
+        plain += [f"{name}.{layer}" for layer in ("inner1", "inner2", "out1", "out2", "out3")]
+        for level, count in enumerate(BLOCKS):
+            told |= {f"{name}.conv{level}.{n}": {"stride": 2 if level > 0 and n == 0 else 1} for n in range(count)}
+    told |= {f"PixelwiseNet.{number}": {} for number in range(3)}
+    told |= {f"cost_regularization.conv{n}": {"stride": stride} for n, stride in enumerate((1, 1, 2, 1, 2, 1))}
+    told |= {f"cost_regularization.conv{n}": {"expansion": 2} for n in (6, 7)}
+    for name in ("CSP_R1", "CSP_R2", "CSP_C1", "CSP_C2"):
+        told |= {f"{name}.conv0": {"stride": (1, 2, 2)}, f"{name}.conv_cost": {}, f"{name}.conv1": {}}
+        told |= {f"{name}.conv2": {"expansion": (1, 2, 2)}}
+    updating = [f"encoder.conv{of}" for of in ("c1", "c2", "d1", "d2", "d", "c")]
+    updating += ["depth_gru.convz", "depth_gru.convr", "depth_gru.convq", "depth_head.conv1", "depth_head.conv2"]
+    plain += [f"update_block_depth{n}.{layer}" for n in (1, 2, 3) for layer in (*updating, "mask.0", "mask.2")]
+    blocks = {name: options | {"is_block": True} for name, options in told.items()}
+    return read_layers(tensors, blocks | {name: {} for name in plain})

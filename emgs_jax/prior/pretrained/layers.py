@@ -96,7 +96,6 @@ def sample(
     """Values linearly between the pixels; zero beyond the image, which falls off within a pixel of its edge.
 
     Args:
-        image: where to look.
         pixels: (x, y); pixel centres are whole numbers.
         is_seen: elsewhere there is zero, too.
     """

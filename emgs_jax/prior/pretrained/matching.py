@@ -1,16 +1,16 @@
 """What networks for multi-view stereo have in common: features of all views, matched at points, and recurrent units."""
 
 import math
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
-import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.pretrained.layers import Conv, convolve, sample
+from emgs_jax.prior.sources import Sources
 
 FINEST, MIDDLE, COARSEST = 2, 4, 8  # pixels of the image to one of the features
 
@@ -23,31 +23,25 @@ class Features(NamedTuple):
     coarsest: Float[Array, "*b h8 w8 c8"]
 
 
-class Sources(NamedTuple):
-    """The views that a depth is matched with.
-
-    Args:
-        features: batched.
-        T_source_reference: reference camera -> source camera, batched likewise.
-        is_used: sources that count.
-    """
-
-    features: Features
-    T_source_reference: jaxlie.SE3
-    is_used: Bool[Array, "s"]
+def pyramid(
+    scales: Sequence[Array], lateral: Sequence[Conv], out: Sequence[Conv], double: Callable[[Array], Array]
+) -> Features:
+    """Features of what is at a half, a quarter and an eighth of the size, with what the coarser ones say."""
+    half, quarter, eighth = scales
+    middle = double(eighth) + convolve(quarter, lateral[0])
+    finest = double(middle) + convolve(half, lateral[1])
+    return Features(*(convolve(image, last) for image, last in zip((finest, middle, eighth), out, strict=True)))
 
 
-class Gru(eqx.Module):
-    """Gates and candidate of a convolutional gated recurrent unit."""
-
-    update: Conv
-    reset: Conv
-    candidate: Conv
+def inverse_between(unit: Array, depth_range: Float[Array, "2"]) -> Array:
+    """0 (farthest) to 1 (nearest) -> 1/z."""
+    near, far = 1.0 / depth_range[0], 1.0 / depth_range[1]
+    return far + unit * (near - far)
 
 
 def seen_from(points: Float[Array, "*b 3"], source: Sources) -> Float[Array, "*b 3"]:
     """Points of the reference camera in that of a source."""
-    return points @ source.T_source_reference.rotation().as_matrix().T + source.T_source_reference.translation()
+    return points @ source.T_source_view.rotation().as_matrix().T + source.T_source_view.translation()
 
 
 def correlation(
@@ -86,9 +80,9 @@ def upsample(values: Float[Array, "h w"], logits: Float[Array, "h w k"], beyond:
     return jnp.einsum("hwk,hwkyx->hywx", around, weights).reshape(ratio * height, ratio * width)
 
 
-def turn(hidden: Float[Array, "h w c"], seen: Float[Array, "h w i"], gru: Gru) -> Float[Array, "h w c"]:
-    """One step of the recurrent unit."""
+def turn(hidden: Float[Array, "h w c"], seen: Float[Array, "h w i"], gates: Sequence[Conv]) -> Float[Array, "h w c"]:
+    """One step of a convolutional gated recurrent unit: the update's gate, the reset's, and the candidate."""
     both = jnp.concatenate([hidden, seen], axis=-1)
-    update, reset = jax.nn.sigmoid(convolve(both, gru.update)), jax.nn.sigmoid(convolve(both, gru.reset))
-    candidate = jnp.tanh(convolve(jnp.concatenate([reset * hidden, seen], axis=-1), gru.candidate))
+    update, reset = (jax.nn.sigmoid(convolve(both, gate)) for gate in gates[:2])
+    candidate = jnp.tanh(convolve(jnp.concatenate([reset * hidden, seen], axis=-1), gates[2]))
     return (1.0 - update) * hidden + update * candidate

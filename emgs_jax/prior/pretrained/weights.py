@@ -4,9 +4,9 @@ A batch normalisation that follows a convolution is a factor and an offset of ea
 """
 
 import hashlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax.numpy as jnp
 import numpy as np
@@ -17,6 +17,7 @@ from emgs_jax.prior.pretrained.layers import Conv
 NORM_EPSILON = 1e-5  # of the variance, as in training
 
 Tensors = Mapping[str, np.ndarray]
+Layers = dict[str, Conv]  # by their names in the published file
 Network = TypeVar("Network")
 
 
@@ -72,3 +73,17 @@ def conv(
         factor = scale / np.sqrt(variance + NORM_EPSILON)
         weight, bias = weight * factor, offset + factor * (bias - mean)
     return Conv(jnp.asarray(weight, jnp.float32), jnp.asarray(bias, jnp.float32), stride, dilation, expansion)
+
+
+def read_layers(part: Tensors, told: Mapping[str, Mapping[str, Any]]) -> Layers:
+    """Convolutions, each with what `conv` is told of it; `is_block`: it is NAME.conv, and NAME.bn comes after it."""
+    found = {}
+    for name, options in told.items():
+        names = (f"{name}.conv", f"{name}.bn") if options.get("is_block") else (name,)
+        found[name] = conv(part, *names, **{key: value for key, value in options.items() if key != "is_block"})
+    return found
+
+
+def layers(network: Mapping[str, Any], prefix: str, names: Iterable[object]) -> list[Conv]:
+    """Those that are called PREFIX.NAME."""
+    return [network[f"{prefix}.{name}"] for name in names]

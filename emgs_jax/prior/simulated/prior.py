@@ -31,7 +31,7 @@ import numpy as np
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.features.text import random_embeddings
-from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
+from emgs_jax.prior.base import DenseView, Prior, PriorPrediction, Provenance, Window, predicted
 from emgs_jax.prior.simulated.noise import (
     Stream,
     autoregressive,
@@ -103,16 +103,12 @@ class Simulated(Prior):
         confusion: float | int = 0.0,
     ) -> None:
         if version not in VERSIONS:
-            raise ValueError(
-                f"prior.version must be 1 (no drift) or 2 (drifts beyond the anchor's view), got {version}"
-            )
+            raise ValueError(f"prior.version must be 1 (no drift) or 2 (drift beyond the anchor's view), got {version}")
         if not 0 <= level <= MAX_LEVEL:
             raise ValueError(f"prior.level must be from 0 (an exact prior) to {MAX_LEVEL:g}, got {level}")
         if not isinstance(seed, int) or not isinstance(feature_size, int) or seed < 0 or feature_size < 1:
-            raise ValueError(
-                "prior.seed and prior.feature_size must be whole numbers, from 0 and from 1, got "
-                f"{seed} and {feature_size}"
-            )
+            numbers = f"{seed} and {feature_size}"
+            raise ValueError(f"prior.seed and prior.feature_size must be whole, from 0 and from 1, got {numbers}")
         if not 0 <= confusion <= 1:
             raise ValueError(f"prior.confusion is a probability, from 0 to 1, got {confusion}")
         self.level, self.seed, self.version, self.standard = float(level), int(seed), int(version), Standard()
@@ -158,9 +154,8 @@ class Simulated(Prior):
         T_anchor_view = self._poses(window, [frame.T_world_camera for frame in frames], drift[1:], is_held, draw)
         T_anchor_view[:, :3, 3] *= scale
         views = [self._geometry(draw, by_index[index], intrinsics, scale) for index in window.dense]
-        points, confidence, mask = (np.stack(parts) for parts in zip(*views, strict=True))
         features = np.stack([self._features(draw, by_index[index]) for index in window.dense])
-        return PriorPrediction(window, T_anchor_view, points, confidence, mask, features)
+        return predicted(window, T_anchor_view, views, features)
 
     def _is_held(self, anchor: Frame, middle: Frame, intrinsics: Sequence[float]) -> bool:
         """Test whether the anchor shares enough surface with the window's middle view to constrain the window."""
@@ -204,9 +199,7 @@ class Simulated(Prior):
         T_left_right = np.linalg.inv(T_true[left]) @ T_true[left + 1]
         return T_left_right @ rigid(xi, self.level * noise.pair_translation, self.level * noise.pair_rotation)
 
-    def _geometry(
-        self, inference: int, frame: Frame, intrinsics: Sequence[float], scale: float
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _geometry(self, inference: int, frame: Frame, intrinsics: Sequence[float], scale: float) -> DenseView:
         """Return points (h, w, 3), confidence (h, w) and mask (h, w) of one view."""
         depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0), frame.depth, 0).astype(np.float32)
         mask = depth > 0

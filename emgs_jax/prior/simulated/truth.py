@@ -6,7 +6,7 @@ import numpy as np
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
-from emgs_jax.prior.base import Window
+from emgs_jax.prior.base import Window, check_order
 
 
 def no_truth(what: str) -> str:
@@ -19,28 +19,20 @@ def check_frames(window: Window, frames: Sequence[Frame], needed: Collection[int
     Args:
         needed: indices of the frames whose depth is looked at.
     """
-    indices = tuple(frame.index for frame in frames)
-    if indices != window.views:
-        raise ValueError(f"frames must be those of window.views {window.views} in that order, got {indices}")
+    check_order(window, frames)
     for frame in frames:
-        label, pose, depth = f"frame {frame.index} ({frame.name})", frame.T_world_camera, frame.depth
-        if pose is None:
+        label = f"frame {frame.index} ({frame.name})"
+        if frame.T_world_camera is None:
             raise ValueError(no_truth(f"{label} has no true pose"))
-        if np.shape(pose) != (4, 4) or not np.isfinite(pose).all():
-            raise ValueError(f"the true pose of {label} must be a finite (4, 4) matrix: leave the frame out")
-        if frame.index in needed and depth is None:
+        if frame.index in needed and frame.depth is None:
             raise ValueError(no_truth(f"{label} has no depth"))
-        if depth is not None and depth.shape != frame.image.shape[:2]:
-            raise ValueError(
-                f"the depth of {label} must have its image's size {frame.image.shape[:2]}, got {depth.shape}"
-            )
     if window.inference == 0 and not any((frame.depth > 0).any() for frame in frames if frame.index in needed):
         raise ValueError(
             no_truth(
                 f"0 of the first {len(needed)} images, from {frames[0].name} on, have a true depth: it is 0 everywhere"
             )
         )
-    return dict(zip(indices, frames, strict=True))
+    return {frame.index: frame for frame in frames}
 
 
 def shared_points(a: Frame, b: Frame, intrinsics: Sequence[float], tolerance: float, num_columns: int) -> float:

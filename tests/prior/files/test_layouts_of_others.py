@@ -13,7 +13,7 @@ from written_predictions import Named, asked, truth, write_npz
 
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.prior.base import relative_poses
-from emgs_jax.prior.files.exports import dust3r_crop, mapanything_crop, read_export, vggt_place
+from emgs_jax.prior.files.layouts import dust3r_crop, mapanything_crop, read_export, vggt_place
 from emgs_jax.prior.files.prior import image_intrinsics
 from emgs_jax.prior.files.view import Camera, View, at_frame
 
@@ -107,21 +107,25 @@ def write_record3d(folder: Path) -> None:
 
 
 LAYOUTS = {
-    "MapAnything": (write_mapanything, {}, 1e-5, None),
-    "Depth Anything 3": (write_depth_anything_3, {"scale": "metric"}, 1e-5, None),
-    "CUT3R": (write_cut3r, {"scale": "metric"}, 1e-5, None),
-    "COLMAP": (write_colmap, {"scale": "metric"}, 1e-5, -1),
-    "ScanNet": (write_scannet, {}, 0.9e-3, -1),  # half a millimetre along the ray
-    "Record3D": (write_record3d, {}, 1e-5, None),
+    "MapAnything": (write_mapanything, True, 1e-5, None),
+    "Depth Anything 3": (write_depth_anything_3, False, 1e-5, None),
+    "CUT3R": (write_cut3r, False, 1e-5, None),
+    "COLMAP": (write_colmap, False, 1e-5, -1),
+    "ScanNet": (write_scannet, True, 0.9e-3, -1),  # half a millimetre along the ray
+    "Record3D": (write_record3d, True, 1e-5, None),
 }
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
 def test_what_a_program_writes_is_read_as_the_truth_that_it_holds(layout, tmp_path, capsys):
     """The last frame may be one that the program could not solve."""
-    write, keys, tolerance, lost = LAYOUTS[layout]
+    write, is_metric, tolerance, lost = LAYOUTS[layout]
     write(tmp_path)
-    _, predictions = asked(tmp_path, NUMBERS, **keys)
+    prior, predictions = asked(tmp_path, NUMBERS)
+    assert prior.provenance.settings["scale"] == ("metric" if is_metric else "arbitrary")
+    if not is_metric:
+        assert np.median(predictions[0].points[0, ..., 2]) == pytest.approx(2.0, rel=1e-5)
+        _, predictions = asked(tmp_path, NUMBERS, scale="metric")
     assert f"layout {layout}, metres" in capsys.readouterr().out
     poses = np.stack([frame.T_world_camera for frame in truth()])
     if lost is not None:
@@ -134,14 +138,6 @@ def test_what_a_program_writes_is_read_as_the_truth_that_it_holds(layout, tmp_pa
             assert prediction.mask[row].all() == is_known and prediction.mask[row].any() == is_known
             points = backproject(truth()[index].depth * is_known, (fx, fy, cx, cy))
             np.testing.assert_allclose(prediction.points[row], points, atol=tolerance)
-
-
-@pytest.mark.parametrize("layout", ["Depth Anything 3", "CUT3R", "COLMAP"])
-def test_what_knows_no_unit_is_taken_up_to_scale(layout, tmp_path):
-    LAYOUTS[layout][0](tmp_path)
-    prior, predictions = asked(tmp_path, NUMBERS)
-    assert prior.provenance.settings["scale"] == "arbitrary"
-    assert np.median(predictions[0].points[0, ..., 2]) == pytest.approx(2.0, rel=1e-5)
 
 
 def write_vggt(folder: Path, camera: Camera, poses: np.ndarray, height: int) -> None:
@@ -217,12 +213,6 @@ def test_vggts_file_is_read_with_its_own_crop(tmp_path):
         np.testing.assert_allclose(steps, expected / expected[1], atol=1e-6)
 
 
-def test_a_grid_that_cannot_be_of_the_images_is_refused_with_what_may_have_turned_them():
-    view = View("row 0", np.ones((392, 518)), None, (400.0, 400.0, 258.5, 195.5))
-    with pytest.raises(ValueError, match=r"is 518x392, .* 0\.750 times as wide as high VGGT has 518x518: .*EXIF"):
-        vggt_place(Camera((48, 64), (60, 60, 23.5, 31.5)), view)
-
-
 def test_a_scene_as_a_network_returns_it_has_a_dimension_more_and_two_scenes_are_refused(tmp_path):
     """Who followed "must be 4 by 4, camera -> world" wrote wrong poses."""
     poses = np.tile(np.eye(4), (tiny_run.NUM_FRAMES, 1, 1))
@@ -240,34 +230,39 @@ def test_a_scene_as_a_network_returns_it_has_a_dimension_more_and_two_scenes_are
             np.testing.assert_array_equal(read_export(path).read(3).geometry, arrays["depth"][3, ..., 0])
 
 
-@pytest.mark.parametrize(
-    ("damage", "message"),
-    [
-        (lambda folder: np.savez(folder / "predictions.npz", color=np.ones(2)), "has color, and known are MapAnything"),
-        (lambda folder: (folder / "predictions.npz").write_bytes(b"no"), "has no arrays, and known are"),
-    ],
-)
-def test_a_file_of_no_known_network_is_named(damage, message, tmp_path):
-    damage(tmp_path)
+def edit(folder, name, change):
+    path = folder / name
+    path.write_bytes(change(path.read_bytes()))
+
+
+DAMAGED = [
+    (write_mapanything, ("predictions.npz", lambda content: b"no"), "has no arrays, and known are MapAnything"),
+    (
+        write_colmap,
+        ("stereo/depth_maps/0.jpg.geometric.bin", lambda c: c[:-4]),
+        "0.jpg.geometric.bin is no depth map of",
+    ),
+    # Its distortion was ignored: the dense maps of COLMAP are of undistorted images.
+    (
+        write_colmap,
+        ("sparse/cameras.txt", lambda content: content.replace(b"PINHOLE", b"OPENCV").strip() + b" .1 0 0 0\n"),
+        "cameras.txt: depth maps are of undistorted images",
+    ),
+]
+
+
+@pytest.mark.parametrize(("write", "damage", "message"), DAMAGED)
+def test_a_file_that_is_of_no_known_program_or_ends_early_is_named(write, damage, message, tmp_path):
+    write(tmp_path)
+    edit(tmp_path, *damage)
     with pytest.raises(ValueError, match=message):
-        asked(tmp_path)
-
-
-def test_a_depth_map_of_colmap_that_ends_early_is_named(tmp_path):
-    write_colmap(tmp_path)
-    path = tmp_path / "stereo" / "depth_maps" / "0.jpg.geometric.bin"
-    path.write_bytes(path.read_bytes()[:-4])
-    with pytest.raises(ValueError, match=r"0.jpg.geometric.bin is no depth map of COLMAP"):
         asked(tmp_path, NUMBERS)
 
 
-def test_depth_maps_beside_the_model_of_distorted_images_are_refused(tmp_path):
-    """Its distortion was ignored: the dense maps of COLMAP are of undistorted images."""
-    write_colmap(tmp_path)
-    path = tmp_path / "sparse" / "cameras.txt"
-    path.write_text(path.read_text().replace("PINHOLE", "OPENCV").strip() + " .1 0 0 0\n")
-    with pytest.raises(ValueError, match=r"cameras.txt: depth maps are of undistorted images"):
-        asked(tmp_path, NUMBERS)
+def test_a_grid_that_cannot_be_of_the_images_is_refused_with_what_may_have_turned_them():
+    view = View("row 0", np.ones((392, 518)), None, (400.0, 400.0, 258.5, 195.5))
+    with pytest.raises(ValueError, match=r"is 518x392, .* 0\.750 times as wide as high VGGT has 518x518: .*EXIF"):
+        vggt_place(Camera((48, 64), (60, 60, 23.5, 31.5)), view)
 
 
 def test_one_file_may_be_given_in_place_of_its_folder(tmp_path):

@@ -100,26 +100,11 @@ def test_files_without_the_frames_names_are_in_the_order_of_their_numbers(tmp_pa
         rows_of(Frames([None] * 5), found.names, tmp_path)
 
 
-def test_one_file_may_be_given_by_its_own_path(tmp_path):
-    np.savez(tmp_path / "video_depths.npz", depths=VALUES)
-    found = open_depths(tmp_path / "video_depths.npz", "affine_inverse", 1000.0)
-    np.testing.assert_array_equal(found.read(2), VALUES[2])
-
-
 def test_more_files_than_frames_are_no_error_by_name_and_a_frame_without_a_file_is(tmp_path):
     each(tmp_path, save, "_depth.npy")
     found = open_depths(tmp_path, "affine_inverse", 1000.0)
-    assert [found.names[row] for row in rows_of(Frames(["a 10", "a 2"]), found.names, tmp_path)] == [
-        "a 10_depth",
-        "a 2_depth",
-    ]
-    each(tmp_path, save, "_conf.npy")  # was read as depth, as it comes first
-    found = open_depths(tmp_path, "affine_inverse", 1000.0)
-    with pytest.raises(ValueError, match=r"several kinds for each frame, \*_conf, \*_depth: leave one kind"):
-        rows_of(Frames(["a 10", "a 2"]), found.names, tmp_path)
-    for path in tmp_path.glob("*_conf.npy"):
-        path.unlink()
-    found = open_depths(tmp_path, "affine_inverse", 1000.0)
+    rows = rows_of(Frames(["a 10", "a 2"]), found.names, tmp_path)
+    assert [found.names[row] for row in rows] == ["a 10_depth", "a 2_depth"]
     with pytest.raises(ValueError, match="no file for 1 of 3 frames, the first is a 3_depth"):
         rows_of(Frames(["a 1", "a 2", "a 3"]), found.names, tmp_path)
 
@@ -141,13 +126,8 @@ def test_metric_pictures_have_units_of_a_metre(tmp_path):
 
 
 def config(folder, kind="affine_inverse"):
-    words = (
-        "prior=multiview_stereo",
-        "prior/dense=files",
-        f"prior.dense.folder='{folder}'",
-        f"prior.dense.kind={kind}",
-    )
-    return hydra.utils.instantiate(compose(*words).prior.dense)
+    words = f"prior.dense.folder='{folder}'", f"prior.dense.kind={kind}"
+    return hydra.utils.instantiate(compose("prior=multiview_stereo", "prior/dense=files", *words).prior.dense)
 
 
 def test_provenance_knows_the_contents_and_not_the_place(tmp_path):
@@ -218,14 +198,8 @@ def test_a_landmark_is_as_uncertain_as_its_parallax_says():
     T = np.tile(np.eye(4), (2, 1, 1))
     T[1, 0, 3] = 0.1
     points = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 4.0]])
-    two = Structure(
-        [World(points, found.worlds[0].camera)],
-        np.zeros(2, int),
-        T,
-        np.zeros((2, 6, 6)),
-        [np.arange(2)] * 2,
-        np.zeros(2, bool),
-    )
+    world, shown = World(points, found.worlds[0].camera), [np.arange(2)] * 2
+    two = Structure([world], np.zeros(2, int), T, np.zeros((2, 6, 6)), shown, np.zeros(2, bool))
     landmarks = landmarks_of(two, 0, point_information(two, 0, pixel_std=0.5), camera, cell=0.1)
     expected = 0.5 * landmarks.depth / (float(camera.focal[0]) * 0.1)
     np.testing.assert_allclose(landmarks.std, expected, rtol=3e-3)  # f b / distance, which z is to (b / z)²

@@ -1,12 +1,10 @@
 """The standard deviation of a depth: σ_z / z = z σ_px / (f b) beside a baseline, none without one, and its parts."""
 
 import equinox as eqx
-import hydra
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import pytest
-from scene import compose
+from stereo_scene import matrix, sources
 
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.depth import mean_difference, pixels_per_log_depth
@@ -24,19 +22,12 @@ def camera():
 
 
 def moved(*translations, turn=(0.0, 0.0, 0.0)):
-    """T_source_view of cameras that stand there."""
-    turn = jaxlie.SO3.exp(jnp.asarray(turn, jnp.float32))
-    poses = [
-        jaxlie.SE3.from_rotation_and_translation(turn, jnp.asarray(t, jnp.float32)).inverse() for t in translations
-    ]
-    return jaxlie.SE3(jnp.stack([pose.wxyz_xyz for pose in poses]))
+    """Cameras that stand there."""
+    return [matrix(turn, translation) for translation in translations]
 
 
-def pixels(depth, T, is_used=None):
-    used = np.ones(len(T.wxyz_xyz), bool) if is_used is None else np.array(is_used)
-    return np.asarray(
-        jitted_pixels(jnp.asarray(np.full_like(NOTHING, depth), jnp.float32), T, jnp.asarray(used), camera())
-    )
+def pixels(depth, poses, is_used=None):
+    return np.asarray(jitted_pixels(plane(depth), sources(None, poses, is_used), camera()))
 
 
 def plane(depth):
@@ -76,10 +67,9 @@ def test_parts_add_as_variances():
         assert np.isinf(relative_std(np.array([[5.0]]), np.array([[spread]]), np.array([[difference]]), CONFIG))
 
 
-def difference(depth, others, is_used=None, T=None):
-    used = np.ones(len(others), bool) if is_used is None else np.array(is_used)
-    T = moved(*[(0, 0, 0)] * len(others)) if T is None else T
-    return np.asarray(jitted_difference(plane(depth), jnp.stack(others), T, jnp.asarray(used), camera(), DEPTH_STEP))
+def difference(depth, others, is_used=None, poses=None):
+    seen = sources(others, poses or moved(*[(0, 0, 0)] * len(others)), is_used)
+    return np.asarray(jitted_difference(plane(depth), seen, camera(), DEPTH_STEP))
 
 
 @pytest.mark.parametrize("size", [0.1, 1.0, 10.0])
@@ -96,13 +86,7 @@ def test_a_view_that_confirms_nothing_counts_as_one_however_wrong_it_is_and_one_
         np.testing.assert_allclose(difference(2.0, [plane(2.0), other], (True, False)), 0.0, atol=1e-6)
     assert np.isinf(difference(2.0, [none, none])).all() and np.isinf(difference(0.0, [plane(2.0)] * 2)).all()
     turned, beside = moved((0, 0, 0), turn=(0, np.pi, 0)), moved((30.0, 0, 0))
-    assert all(np.isinf(difference(2.0, [plane(2.0)], T=T)).all() for T in (turned, beside))
-
-
-def test_both_ways_to_a_depth_name_their_factors_and_a_bound():
-    for dense in ("sweep", "itermvs"):
-        noise = hydra.utils.instantiate(compose("prior=multiview_stereo", f"prior/dense={dense}").prior.dense.noise)
-        assert isinstance(noise, DepthNoiseConfig) and noise.pixel_std > 0 and 0 < noise.max_std < 1
+    assert all(np.isinf(difference(2.0, [plane(2.0)], poses=poses)).all() for poses in (turned, beside))
 
 
 def test_of_two_estimates_the_surest_counts_and_what_agrees_with_it_moves_it():

@@ -125,7 +125,7 @@ def test_a_wrong_kind_is_named_by_the_landmarks(said, kind, message):
     with pytest.raises(ValueError, match=message):
         fitted([np.abs(v) + 0.01 if kind == "metric" else v for v in values], landmarks, kind)
     rng = np.random.default_rng(0)
-    with pytest.raises(ValueError, match="nothing to do with"):
+    with pytest.raises(ValueError, match="are they of these frames"):
         fitted([rng.permutation(np.abs(v) + 0.01) for v in values], landmarks, kind, min_correlation=0.4)
 
 

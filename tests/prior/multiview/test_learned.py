@@ -1,31 +1,29 @@
 """Depth by a network within the classical prior: the camera of its images, and with real weights a painted plane."""
 
 import os
-import sys
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import hydra
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import pytest
+from random_weights import random_network
 from scene import compose
-from stereo_scene import matrix
+from stereo_scene import AROUND, sources
 
 from emgs_jax.ops.camera import Camera, pixel_grid, rays
+from emgs_jax.ops.pytree import stack
 from emgs_jax.prior.multiview import learned as module
+from emgs_jax.prior.multiview import monocular_network
+from emgs_jax.prior.multiview.dense import Scene
 from emgs_jax.prior.multiview.learned import grid_of, learned
 from emgs_jax.prior.multiview.lens import Lens
-from emgs_jax.prior.multiview.matched import Matched
-
-sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "pretrained"))
-from random_weights import random_network
 
 BESIDE = Path(__file__).resolve().parents[3].parent
 CHECKPOINT = Path(os.environ.get("ITERMVS_CHECKPOINT", BESIDE / "shared/weights/itermvs_blendedmvs_model_000015.ckpt"))
-POSES = [matrix(translation=t) for t in ((0.2, 0, 0), (-0.2, 0, 0), (0, 0.2, 0), (0, -0.2, 0))]
-T_SOURCE_VIEW = np.linalg.inv(np.stack(POSES))
+T_SOURCE_VIEW = np.linalg.inv(np.stack(AROUND))
 ITERMVS = ("prior=multiview_stereo", "prior/dense=itermvs", "prior.dense.magnification=2.0")
 
 
@@ -51,9 +49,9 @@ def plane_view(T_world_camera, slope=0.4):
 
 def estimate(stereo, T_source_view=T_SOURCE_VIEW):
     """What it says of a painted plane."""
-    kept = [stereo.prepare(plane_view(T)[0], Lens([110.0] * 2, [63.5, 47.5])) for T in (np.eye(4), *POSES)]
-    T = jaxlie.SE3.from_matrix(jnp.asarray(np.stack(T_source_view), jnp.float32))
-    return stereo.estimate(Matched(kept[0], kept[1:], T, np.ones(4, bool), np.float32([1.2, 5.0]), camera()))
+    kept = [stereo.prepare(plane_view(T)[0], Lens([110.0] * 2, [63.5, 47.5])) for T in (np.eye(4), *AROUND)]
+    seen = sources(None, np.linalg.inv(T_source_view))._replace(views=stack(kept[1:]))
+    return stereo.estimate(kept[0], seen, jnp.asarray([1.2, 5.0]), camera())
 
 
 @pytest.mark.parametrize(("magnification", "size"), [(1.0, (320, 256)), (2.0, (640, 480)), (0.01, (32, 32))])
@@ -109,7 +107,25 @@ def test_without_its_file_the_prior_is_refused_with_the_place_where_it_is_publis
 def test_a_painted_plane_has_its_depth():
     stereo = learned(hydra.utils.instantiate(prior_node(f"prior.dense.checkpoint={CHECKPOINT}").dense))
     truth = plane_view(np.eye(4))[1]
-    error, turned = ((estimate(stereo, T)[0] / truth - 1)[8:-8, 8:-8] for T in (T_SOURCE_VIEW, POSES))
+    error, turned = ((estimate(stereo, T)[0] / truth - 1)[8:-8, 8:-8] for T in (T_SOURCE_VIEW, AROUND))
     # So small an image it knows to some percent, but evenly; with poses the wrong way round it knows nothing.
     assert abs(np.median(error)) < 0.01 and np.median(np.abs(error)) < 0.05
     assert np.median(np.abs(turned)) > 0.15
+
+
+def test_the_network_is_shown_the_whole_image_and_its_depths_lie_at_the_images_pixels(monkeypatch):
+    """A network that says what is red in every fourth row and column."""
+    monkeypatch.setattr(monocular_network, "load_network", lambda *given: None)
+    monkeypatch.setattr(
+        monocular_network, "jitted_predict", lambda network, image: cv2.resize(np.asarray(image)[..., 0], (64, 48))
+    )
+    monkeypatch.setattr(monocular_network, "begin_monocular", lambda scene, values, config: values)
+    config = hydra.utils.instantiate(compose("prior=multiview_stereo", "prior/dense=meter").prior.dense)
+    image = np.zeros((240, 400, 3), np.uint8)
+    image[..., 0] = np.linspace(0, 255, 400)
+    camera = Camera(np.float32([300, 300]), np.float32([200, 120]), 400, 240)
+    lens = Lens(camera.focal, camera.center)
+    frames, structure = [SimpleNamespace(image=image)], SimpleNamespace(world=np.array([0]))
+    values = monocular_network.way_of_meter(config).begin(Scene(frames, structure, [lens], camera))(0)
+    assert values.shape == (240, 400)
+    np.testing.assert_allclose(values[:, 8:-8], image[:, 8:-8, 0] / 255, atol=0.01)

@@ -2,10 +2,9 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import pytest
-from stereo_scene import CENTER, SIZE, depth_config, matrix, planar_config, plane_image, small_camera
+from stereo_scene import CENTER, SIZE, depth_config, painted, planar_config, small_camera, sources
 
 from emgs_jax.prior.multiview.depth import estimate_depth
 from emgs_jax.prior.multiview.planar import _prediction_std, blank_regions, fill_planes, fit_plane
@@ -42,12 +41,9 @@ def test_a_blank_wall_is_the_plane_of_the_matches_around_its_middle(wrong):
 
 @pytest.mark.parametrize("slope", [0.0, 0.4])
 def test_the_depth_of_images_of_a_blank_wall_in_a_painted_frame_is_within_2_percent(slope):
-    poses = [matrix(translation=t) for t in ((0.2, 0, 0), (-0.2, 0, 0), (0, 0.2, 0), (0, -0.2, 0))]
-    gray, depth = plane_image(np.eye(4), slope, blank=0.45)
-    sources = jnp.asarray(np.stack([plane_image(T, slope, blank=0.45)[0] for T in poses]))
-    relative = jaxlie.SE3.from_matrix(jnp.asarray(np.linalg.inv(np.stack(poses)), jnp.float32))
-    arrays = jnp.asarray(gray), sources, relative, jnp.full(4, True), jnp.asarray([1.2, 5.0])
-    found, spread = (np.asarray(a) for a in eqx.filter_jit(estimate_depth)(*arrays, small_camera(), depth_config()))
+    gray, depth, others = painted(slope, blank=0.45)
+    seen = jnp.asarray(gray), sources(others), jnp.asarray([1.2, 5.0]), small_camera()
+    found, spread = (np.asarray(a) for a in eqx.filter_jit(estimate_depth)(*seen, depth_config()))
     blank, spacing = gray == 0.5, (1 / 1.2 - 1 / 5.0) / 23
     filled, certain = fill_planes(found, spread, gray, spacing, planar_config())
     error, before = (np.abs(z / depth - 1)[blank] for z in (filled, found))

@@ -2,25 +2,18 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-import jaxlie
 import numpy as np
 import pytest
-from stereo_scene import depth_config, matrix, plane_image, small_camera
+from stereo_scene import AROUND, depth_config, matrix, painted, small_camera, sources
 
 from emgs_jax.prior.multiview.plane_sweep import census, inverse_depths, sweep
 
-POSES = [matrix(translation=t) for t in ((0.2, 0, 0), (-0.2, 0, 0), (0, 0.2, 0), (0, -0.2, 0))]
 jitted_sweep = eqx.filter_jit(sweep)
+PLANES = inverse_depths(jnp.asarray(1.2), jnp.asarray(5.0), depth_config().sweep)
 
 
-def relative(poses) -> jaxlie.SE3:
-    """T_source_reference for the reference at the origin."""
-    return jaxlie.SE3.from_matrix(jnp.asarray(np.linalg.inv(np.stack(poses)), jnp.float32))
-
-
-def costs(gray, sources, poses, is_used, planes, config):
-    arrays = jnp.asarray(gray), jnp.asarray(np.stack(sources)), relative(poses), jnp.asarray(is_used)
-    return np.asarray(jitted_sweep(*arrays, planes, small_camera(), config))
+def costs(gray, others, config, planes=PLANES):
+    return np.asarray(jitted_sweep(jnp.asarray(gray), others, planes, small_camera(), config))
 
 
 @pytest.mark.parametrize("scale", [1, 2])
@@ -52,49 +45,37 @@ def test_the_census_does_not_see_exposure_and_planes_are_uniform_in_inverse_dept
 
 @pytest.mark.parametrize("slope", [0.0, 0.4])
 def test_the_cheapest_plane_is_the_true_inverse_depth(slope):
-    config = depth_config().sweep
-    gray, depth = plane_image(np.eye(4), slope)
-    planes = inverse_depths(jnp.asarray(1.2), jnp.asarray(5.0), config)
-    cost = costs(gray, [plane_image(T, slope)[0] for T in POSES], POSES, [True] * 4, planes, config)
-    inside = np.s_[8:-8, 8:-8]
-    error = np.abs(np.asarray(planes)[cost.argmin(axis=-1)] - 1 / depth)[inside]
-    spacing = float(planes[1] - planes[0])
+    gray, depth, others = painted(slope)
+    cost = costs(gray, sources(others), depth_config().sweep)
+    error = np.abs(np.asarray(PLANES)[cost.argmin(axis=-1)] - 1 / depth)[8:-8, 8:-8]
+    spacing = float(PLANES[1] - PLANES[0])
     assert np.mean(error < 1.5 * spacing) > 0.9  # the paint repeats itself; aggregation is to resolve that
     assert np.median(error) < 0.5 * spacing
 
 
 def test_the_view_itself_confirms_every_plane_at_no_cost():
-    config = depth_config("prior.dense.depth.sweep.num_best=1").sweep
-    gray, _ = plane_image(np.eye(4), 0.4)
-    planes = inverse_depths(jnp.asarray(1.2), jnp.asarray(5.0), config)
-    cost = costs(gray, [gray], [np.eye(4)], [True], planes, config)
-    assert cost.shape == (48, 64, 24)
-    assert not cost.any()
+    gray, _, _ = painted(0.4)
+    cost = costs(gray, sources([gray], [np.eye(4)]), depth_config("prior.dense.depth.sweep.num_best=1").sweep)
+    assert cost.shape == (48, 64, 24) and not cost.any()
 
 
 def test_the_sources_that_agree_best_decide_and_those_that_do_not_see_the_point_have_no_say():
     """Two good sources and two of noise; oracle: each by itself, and the mean of the two that cost least."""
-    gray, depth = plane_image(np.eye(4), 0.0)
+    gray, depth, others = painted()
     planes = jnp.asarray([1 / 4.0, 1 / depth.mean(), 1 / 1.2], jnp.float32)
     noise = np.random.default_rng(0).uniform(size=(2, *gray.shape)).astype(np.float32)
-    sources = [noise[0], *(plane_image(T, 0.0)[0] for T in POSES[1:3]), noise[1]]
+    images = [noise[0], *others[1:3], noise[1]]
     one, two = (depth_config(f"prior.dense.depth.sweep.num_best={count}").sweep for count in (1, 2))
-    each = [costs(gray, [image], [T], [True], planes, one) for image, T in zip(sources, POSES, strict=True)]
-    together = costs(gray, sources, POSES, [True] * 4, planes, two)
+    each = [costs(gray, sources([image], [T]), one, planes) for image, T in zip(images, AROUND, strict=True)]
+    together = costs(gray, sources(images), two, planes)
     np.testing.assert_allclose(together, np.sort(each, axis=0)[:2].mean(axis=0), rtol=1e-6)
     assert np.median(together[8:-8, 8:-8, 1]) < 0.1
 
 
 def test_a_source_that_does_not_count_is_not_read_and_nowhere_costs_the_same():
-    config = depth_config().sweep
-    gray, _ = plane_image(np.eye(4), 0.0)
-    planes = inverse_depths(jnp.asarray(1.2), jnp.asarray(5.0), config)
-    sources = [plane_image(T, 0.0)[0] for T in POSES[:3]]
-    used = [True, True, False]
-    clean = costs(gray, sources, POSES[:3], used, planes, config)
-    poisoned = costs(gray, [*sources[:2], np.full_like(gray, np.nan)], POSES[:3], used, planes, config)
-    np.testing.assert_array_equal(clean, poisoned)
-    far_away = [matrix(translation=(50.0, 0, 0))] * 3
-    np.testing.assert_array_equal(
-        costs(gray, sources, far_away, [True] * 3, planes, config), np.float32(config.unseen_cost)
-    )
+    config, (gray, _, others) = depth_config().sweep, painted()
+    poisoned = [*others[:3], np.full_like(gray, np.nan)]
+    clean, same = (costs(gray, sources(each, is_used=[True] * 3 + [False]), config) for each in (others, poisoned))
+    np.testing.assert_array_equal(clean, same)
+    far_away = costs(gray, sources(others, [matrix(translation=(50.0, 0, 0))] * 4), config)
+    np.testing.assert_array_equal(far_away, np.float32(config.unseen_cost))

@@ -75,4 +75,4 @@ def test_weights_that_leave_a_parameter_of_the_real_model_random_are_refused(che
     with pytest.raises(hydra.errors.InstantiationException) as raised:
         predict(tmp_path)
     said = str(raised.value.__cause__)
-    assert f"1 missing ({name}) and 1 that it does not have (other.{name})" in said and str(tmp_path) in said
+    assert f'"{name}"' in said and f'"other.{name}"' in said and str(tmp_path) in said

@@ -4,13 +4,22 @@ import numpy as np
 import pytest
 
 from emgs_jax.prior.network.resize import (
+    at_pixels,
     choose_grid,
-    frame_on_grid,
+    on_grid_of,
     plan_resize,
     resize_image,
     resize_intrinsics,
-    to_frame,
 )
+
+
+def frame_on_grid(resize):
+    return on_grid_of(resize.frame, resize.scaled, resize.corner)
+
+
+def to_frame(points, confidence, mask, resize, max_depth_step=0.1):
+    return at_pixels(points, confidence, mask, frame_on_grid(resize), max_depth_step)
+
 
 # What upstream's preprocess_inputs gave: frame, fx, fy, cx, cy, grid, the same on it.
 UPSTREAM = {
@@ -30,25 +39,13 @@ def test_grid_crop_and_intrinsics_are_those_of_the_framework_to_the_last_digit()
         assert matrix.dtype == np.float32
         np.testing.assert_allclose(matrix[[0, 1, 0, 1], [0, 1, 2, 2]], expected, atol=6e-5)  # four digits are printed
         np.testing.assert_array_equal(matrix[[0, 1, 2, 2, 2], [1, 0, 0, 1, 2]], [0, 0, 0, 0, 1])
-    scenes, replica = plan_resize((640, 480), (518, 392)), plan_resize((1200, 680), (518, 294))
+    scenes = plan_resize((640, 480), (518, 392))
     assert (scenes.scaled, scenes.corner) == ((522, 392), (2, 0)) and abs(scenes.scale - 0.8166667) < 1e-6
-    assert (replica.scaled, replica.corner) == ((518, 294), (0, 0)) and abs(replica.scale - 0.4323529) < 1e-6
     for resolution_set, patch in ((518, 14), (512, 16), (504, 14)):
         for aspect in (1.0, 1.33, 1.5, 1.78, 2.0, 3.2, 0.75, 0.65, 0.56, 0.5):
             grid = choose_grid((round(1000 * aspect), 1000), resolution_set)
             assert max(grid) == resolution_set and grid[0] % patch == grid[1] % patch == 0
             assert abs(grid[0] / grid[1] / aspect - 1) < 0.06
-
-
-@pytest.mark.parametrize(("frame", "grid", "beside"), [((1200, 680), (518, 294), 0.41), ((640, 480), (518, 392), 0.33)])
-def test_what_a_grid_pixel_shows_is_beside_its_ray_by_what_upstreams_rounding_makes(frame, grid, beside):
-    """Its camera matrix follows the scale, its image the whole pixels of the scaled size."""
-    resize, size = plan_resize(frame, grid), np.array(frame)
-    fx, _, cx, _ = intrinsics = (600.0, 600.0, *((size - 1) / 2))
-    columns, _ = frame_on_grid(resize)
-    matrix = resize_intrinsics(intrinsics, resize)
-    of_camera = matrix[0, 0] * (np.arange(frame[0]) - cx) / fx + matrix[0, 2]
-    assert abs(np.abs(of_camera - columns).max() - beside) < 0.005
 
 
 def test_a_frame_of_the_grids_size_stays_as_it_is():
@@ -61,7 +58,7 @@ def test_a_frame_of_the_grids_size_stays_as_it_is():
     )
     points = rng.uniform(1, 2, (42, 56, 3)).astype(np.float32)
     confidence, mask = rng.uniform(1, 5, (42, 56)).astype(np.float32), rng.uniform(size=(42, 56)) < 0.7
-    back = to_frame(points, confidence, mask, resize, 0.03)
+    back = to_frame(points, confidence, mask, resize)
     np.testing.assert_array_equal(back[2], mask)
     np.testing.assert_array_equal(back[0][mask], points[mask])
     np.testing.assert_array_equal(back[1][mask], confidence[mask])
@@ -98,7 +95,7 @@ def test_a_plane_comes_back_as_the_same_plane_on_the_rays_of_the_frames_pixels(f
     K = np.array([[intrinsics[0], 0, intrinsics[2]], [0, intrinsics[1], intrinsics[3]], [0, 0, 1]])
     expected = plane(frame[::-1], K, normal, distance)
     ones = np.ones((42, 56), np.float32)
-    points, _, mask = to_frame(on_grid, ones, ones > 0, resize, 0.1)
+    points, _, mask = to_frame(on_grid, ones, ones > 0, resize)
     columns, rows = frame_on_grid(resize)
     is_inner = ((rows >= 0) & (rows <= 41))[:, None] & ((columns >= 0) & (columns <= 55))
     assert mask.all() and is_inner.mean() > 0.9
@@ -109,7 +106,7 @@ def test_a_plane_comes_back_as_the_same_plane_on_the_rays_of_the_frames_pixels(f
 def test_beyond_the_crop_the_mask_is_off():
     resize = plan_resize((60, 42), (42, 42))  # 9 columns are cropped on either side
     points = np.ones((42, 42, 3), np.float32)
-    got, confidence, mask = to_frame(points, np.full((42, 42), 3, np.float32), np.ones((42, 42), bool), resize, 0.1)
+    got, confidence, mask = to_frame(points, np.full((42, 42), 3, np.float32), np.ones((42, 42), bool), resize)
     assert mask[:, 9:51].all() and not mask[:, :9].any() and not mask[:, 51:].any()
     assert not got[~mask].any() and (confidence[~mask] == 1).all() and (confidence[mask] == 3).all()
 
@@ -121,7 +118,7 @@ def test_nothing_is_interpolated_across_a_depth_edge_or_with_a_masked_pixel():
     mask = np.ones((42, 56), bool)
     mask[10:20, 5:15] = False
     points[~mask] = np.nan
-    got, _, on = to_frame(points, np.ones((42, 56), np.float32), mask, resize, 0.1)
+    got, _, on = to_frame(points, np.ones((42, 56), np.float32), mask, resize)
     assert set(np.unique(got[on][:, 2].round(5))) == {1.0, 3.0}
     columns, rows = frame_on_grid(resize)
     nearest = mask[np.floor(rows + 0.5).astype(int)[:, None], np.floor(columns + 0.5).astype(int)]

@@ -12,15 +12,13 @@ import hydra
 import numpy as np
 import pytest
 from network_double import Double
-from network_stand_in import DINOV2, Loaded, clone, settings, write_checkpoint, write_weights
-from omegaconf.errors import InterpolationToMissingValueError
+from network_stand_in import DINOV2, WEIGHTS, Loaded, clone, load, write_checkpoint, write_weights
 from tiny_run import compose
 
 from emgs_jax.prior.base import windows
-from emgs_jax.prior.network import loading
+from emgs_jax.prior.network import torch_network
 from emgs_jax.prior.network.framework import MODELS, USED_OUTPUTS, build_views, check_checkpoint
 from emgs_jax.prior.network.resize import plan_resize
-from emgs_jax.prior.network.torch_network import load_network
 
 
 def make(folder, *overrides):
@@ -28,10 +26,16 @@ def make(folder, *overrides):
     return hydra.utils.instantiate(config)
 
 
-def made(framework, model, name):
-    """The prior around a network that the framework configures."""
+def made(framework, name, call=lambda views, answer: answer(views), reads=()):
+    """The prior around a network that the framework configures, and the network; `call` makes its answer."""
+
+    class Network(Loaded):
+        def __call__(self, views):
+            return call(views, super().__call__)
+
+    model = Network(Double(framework[0], convert=sys.modules["torch"].from_numpy, patch=16), reads)
     framework[2].init_model_from_config = lambda name, device: model
-    return make("null", f"prior.model={name}", "prior.resolution=[64,48]")
+    return make("null", f"prior.model={name}", "prior.resolution=[64,48]"), model
 
 
 def ask(prior, data, number=0):
@@ -79,35 +83,12 @@ def test_a_package_of_another_torch_is_named_instead_of_what_it_broke(torch, sit
     (site / "mapanything" / "models.py").write_text(broken)
     (site / "torchvision.py").write_text(broken)
     with pytest.raises(ValueError, match="cannot import mapanything.models: torchvision .*nms does not exist"):
-        loading.import_framework("mapanything.models")
-
-
-def test_a_checkpoint_that_cannot_be_loaded_without_a_network_is_named_with_the_remedy(tmp_path):
-    with pytest.raises(ValueError, match=r"prior.checkpoint is not set.*map-anything-apache"):
-        check_checkpoint(None, tmp_path)
-    with pytest.raises(ValueError, match="no config.json and no model.safetensors"):
-        check_checkpoint(tmp_path / "nowhere", tmp_path)
-    folder = write_checkpoint(tmp_path / "half", {"encoder_str": "dinov2_giant_24_layers"})
-    with pytest.raises(ValueError, match='add "torch_hub_pretrained": false to its encoder_config'):
-        check_checkpoint(folder, tmp_path)
-    write_checkpoint(folder, DINOV2)
-    with pytest.raises(ValueError, match="clone the GitHub repository facebookresearch/dinov2"):
-        check_checkpoint(folder, tmp_path / "hub")
-    clone(tmp_path / "hub")
-    check_checkpoint(folder, tmp_path / "hub")
-    check_checkpoint(write_checkpoint(folder, {"encoder_str": "patch_embedder"}), tmp_path / "no hub")
-    for content in ("{", "[1, 2]", '{"name": "x"}', '{"encoder_config": 3}'):
-        (folder / "config.json").write_text(content)
-        with pytest.raises(ValueError, match="config.json is no configuration of MapAnything"):
-            check_checkpoint(folder, tmp_path)
-    (folder / "model.safetensors").unlink()
-    with pytest.raises(ValueError, match="half has no model.safetensors"):
-        check_checkpoint(folder, tmp_path)
+        torch_network.import_framework("mapanything.models")
 
 
 def test_a_checkpoint_is_loaded_and_asked_without_any_request(torch, framework, no_network, weights):
-    data, _, _ = framework
-    load = torch.hub.load
+    data, load = framework[0], torch.hub.load
+    check_checkpoint(write_checkpoint(weights.parent / "other", {"encoder_str": "patch_embedder"}), Path("no hub"))
     prior = make(weights)
     assert os.environ["HF_HUB_OFFLINE"] == os.environ["TRANSFORMERS_OFFLINE"] == "1"
     assert no_network == [] and torch.hub.load is load
@@ -135,16 +116,13 @@ GEOMETRY = ("camera_intrinsics", "depthmap", "camera_pose", "true_shape")
 def test_wrappers_find_in_every_view_what_they_read(torch, framework, monkeypatch, name, reads):
     """Some could not work: a KeyError in the first window. MASt3R takes views of one name for one view."""
     data = framework[0]
-    model = Loaded(Double(data, convert=torch.from_numpy, patch=16), reads)
     monkeypatch.setitem(MODELS, name, replace(MODELS[name], needs_gpu=False))
-    prior = made(framework, model, name)
+    prior, model = made(framework, name, reads=reads)
     prediction = ask(prior, data, 1)
     if "instance" in reads:
         assert len({view["instance"][0] for view in model.given}) == len(prediction.window.views)
     else:
-        assert [tuple(view["depthmap"].shape) for view in model.given] == [(1, 48, 64, 1)] * len(
-            prediction.window.views
-        )
+        assert {tuple(view["depthmap"].shape) for view in model.given} == {(1, 48, 64, 1)}
         assert torch.equal(model.given[0]["true_shape"], torch.tensor([[48, 64]]))
     assert model.is_evaluated and prediction.mask.all() and prior.provenance.settings["is_calibrated"] is False
     if name == "mast3r":  # the others have a unit of their own
@@ -156,39 +134,34 @@ def test_every_window_has_a_cache_of_its_own(torch, framework):
     """MASt3R keeps under the names of the views what it made of them together with the other views."""
     folders = []
 
-    class Keeps(Loaded):
-        cache_dir = "somewhere"
+    def keep(views, answer):
+        folders.append(Path(model.cache_dir))
+        assert folders[-1].is_dir() and not any(folders[-1].iterdir())
+        (folders[-1] / "kept").touch()
+        return answer(views)
 
-        def __call__(self, views):
-            folders.append(Path(self.cache_dir))
-            assert folders[-1].is_dir() and not any(folders[-1].iterdir())
-            (folders[-1] / "kept").touch()
-            return super().__call__(views)
-
-    data = framework[0]
-    prior = made(framework, Keeps(Double(data, convert=torch.from_numpy, patch=16), ("label", "instance")), "mast3r")
+    prior, model = made(framework, "mast3r", keep, ("label", "instance"))
+    model.cache_dir = "somewhere"
     for number in range(2):
-        ask(prior, data, number)
+        ask(prior, framework[0], number)
     assert len(set(folders)) == len(folders) > 1 and not any(folder.exists() for folder in folders)
 
 
 def test_networks_may_optimise_and_draw_and_give_the_same_answer_twice(torch, framework):
     """DUSt3R's wrapper aligns its points by gradients, which inference_mode forbids, from a random start."""
 
-    class Optimises(Loaded):
-        def __call__(self, views):
-            with torch.enable_grad():
-                start = torch.rand(1, requires_grad=True)
-                (start - views[0]["img"].mean()).square().sum().backward()
-            outputs = super().__call__(views)
-            outputs[0]["pts3d_cam"] = outputs[0]["pts3d_cam"] + start + start.grad
-            return outputs
+    def optimise(views, answer):
+        with torch.enable_grad():
+            start = torch.rand(1, requires_grad=True)
+            (start - views[0]["img"].mean()).square().sum().backward()
+        outputs = answer(views)
+        outputs[0]["pts3d_cam"] = outputs[0]["pts3d_cam"] + start + start.grad
+        return outputs
 
-    data = framework[0]
-    prior = made(framework, Optimises(Double(data, convert=torch.from_numpy, patch=16)), "dust3r")
-    a = ask(prior, data)
+    prior, _ = made(framework, "dust3r", optimise)
+    a = ask(prior, framework[0])
     torch.rand(1)  # of somebody else
-    b = ask(prior, data)
+    b = ask(prior, framework[0])
     assert a.points.tobytes() == b.points.tobytes() and a.mask.any()
 
 
@@ -197,89 +170,59 @@ def test_the_precision_of_a_wrapper_is_that_of_the_provenance(torch, framework, 
     """Wrappers have a precision of their own, and the provenance said what the config asked for."""
     _, model, models = framework
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
-    network = load_network(settings(name, device="cuda", amp="fp16"))
+    network = load(name, device="cuda", amp="fp16")
     assert network.described == {"device": "cuda", "amp": expected}
     own = {"dust3r": ("bf16", None), "must3r": ("fp16", None), "vggt": ("bf16", torch.float16)}
     assert (model.amp, model.dtype) == own[name]
     models.init_model_from_config = lambda name, device: torch.nn.Linear(1, 1)
     with pytest.raises(ValueError, match=r"prior.model=pi3 keeps no \.dtype: this version of mapanything"):
-        load_network(settings("pi3", device="cuda"))
+        load("pi3", device="cuda")
 
 
 def test_a_cpu_that_nobody_asked_for_is_mentioned_and_a_gpu_that_is_not_there_is_an_error(
     framework, capsys, monkeypatch
 ):
-    load_network(settings("dust3r", device="cpu"))
+    load("dust3r", device="cpu")
     assert "finds no GPU" not in capsys.readouterr().err
     monkeypatch.setattr(sys.modules["torch"].cuda, "is_available", lambda: False)
-    load_network(settings("dust3r", device=None))
+    load("dust3r", device=None)
     assert "finds no GPU, so prior.model=dust3r runs on the CPU, which is slow" in capsys.readouterr().err
     with pytest.raises(ValueError, match="device=cuda:1, but torch .* finds no GPU"):
-        load_network(settings(device="cuda:1"))
+        load(device="cuda:1")
     for model in (name for name, known in MODELS.items() if known.needs_gpu):
         with pytest.raises(ValueError, match=f"prior.model={model} cannot be built without a GPU"):
-            load_network(settings(model))
+            load(model)
 
 
 def test_only_what_is_used_is_copied_and_numbers_of_16_bits_become_float32(torch, framework):
-    data, _, models = framework
+    def halved(value):
+        tensor = torch.from_numpy(value)
+        return tensor.bfloat16() if tensor.is_floating_point() else tensor
 
-    class Counted:
-        """A tensor that counts what is taken from it."""
-
-        copied = []
-
-        def __init__(self, value):
-            self.tensor = torch.from_numpy(value)
-
-        def detach(self):
-            self.copied.append(self)
-            return self.tensor.bfloat16() if self.tensor.is_floating_point() else self.tensor
-
-    models.init_model_from_config = lambda name, device: Loaded(Double(data, convert=Counted))
+    framework[2].init_model_from_config = lambda name, device: Loaded(Double(framework[0], convert=halved))
     images = [np.full((42, 56, 3), i, np.uint8) for i in range(2)]
-    views = build_views(images, data.intrinsics, plan_resize((40, 30), (56, 42)), MODELS["vggt"], None)
-    outputs = load_network(settings("dust3r")).infer(views)
-    assert set(outputs[0]) == set(USED_OUTPUTS) and len(Counted.copied) == 2 * len(USED_OUTPUTS)
-    kinds = {key: value.dtype for key, value in outputs[0].items()}
+    views = build_views(images, framework[0].intrinsics, plan_resize((40, 30), (56, 42)), MODELS["vggt"], None)
+    (output, _) = load("dust3r").infer(views)
+    kinds = {key: value.dtype for key, value in output.items()}
     assert kinds == dict.fromkeys(USED_OUTPUTS, np.float32) | {"non_ambiguous_mask": np.bool_}
 
 
 def test_rays_that_no_camera_has_are_no_answer_and_no_end(torch, framework):
     """Upstream fits a camera by least squares, and said that a matrix is singular."""
-    solve, data = torch.linalg.inv, framework[0]
-
-    class Degenerate(Loaded):
-        def __call__(self, views):
-            return solve(torch.zeros(2, 2))
-
-    prediction = ask(made(framework, Degenerate(Double(data)), "dust3r"), data)
+    solve = torch.linalg.inv
+    prediction = ask(made(framework, "dust3r", lambda *_: solve(torch.zeros(2, 2)))[0], framework[0])
     assert not prediction.mask.any() and not prediction.points.any() and (prediction.confidence == 1).all()
     np.testing.assert_array_equal(prediction.T_anchor_view[0], np.eye(4))
     assert np.isnan(prediction.T_anchor_view[1:]).all()
     assert prediction.points.shape == (len(prediction.window.dense), 30, 40, 3)
 
 
-class NotCached(FileNotFoundError, ValueError):
-    """As huggingface_hub's error where it is offline."""
-
-
 @pytest.mark.parametrize(
     ("model", "error", "text"),
     [
         ("metric_dust3r", ImportError("No module named 'dust3r'"), r"pip install -e '\.\[dust3r\]'"),
-        ("pi3x", ImportError("No module named 'one'"), r"pip install -e '\.\[pi3\]'"),
-        ("pow3r_ba", ImportError("No module named 'one'"), r"pip install -e '\.\[pow3r\]'"),
-        ("da3", ImportError("No module named 'one'"), r"pip install -e '\.\[depth-anything-3\]'"),
-        ("metric_dust3r", NotCached("cannot find it"), "is not in the local caches .* download it once beforehand"),
-        ("metric_dust3r", OSError("offline"), "is not in the local caches .* download it once beforehand"),
-        ("metric_dust3r", InterpolationToMissingValueError("???"), "set in configs/machine/default.yaml in the clone"),
-        (
-            "metric_dust3r",
-            FileNotFoundError(2, "No such file or directory", "/weights/DUSt3R.pth"),
-            "metric_dust3r needs the file /weights/DUSt3R.pth .*MASt3R, metric.*root_pretrained_checkpoints_dir",
-        ),
-        ("metric_dust3r", RuntimeError("reader failed\nline 2"), r"cannot be made \(reader failed\): .*damaged"),
+        ("da3", OSError("offline"), r"cannot be made \(offline\)\. Nothing is downloaded .*DA3-GIANT.*local caches"),
+        ("pi3x", RuntimeError("reader failed\nline 2"), r"made \(reader failed\)\..*root_pretrained_checkpoints_dir"),
     ],
 )
 def test_what_another_network_lacks_is_said(framework, monkeypatch, model, error, text):
@@ -289,7 +232,7 @@ def test_what_another_network_lacks_is_said(framework, monkeypatch, model, error
     monkeypatch.setattr(sys.modules["torch"].cuda, "is_available", lambda: True)
     framework[2].init_model_from_config = fail
     with pytest.raises(ValueError, match=text):
-        load_network(settings(model, device="cuda"))
+        load(model, device="cuda")
 
 
 def test_composing_the_frameworks_configuration_leaves_ours_alone(framework):
@@ -304,12 +247,12 @@ def test_composing_the_frameworks_configuration_leaves_ours_alone(framework):
     models.init_model_from_config = compose_there
     with hydra.initialize(version_base=None, config_path=None):
         outer = GlobalHydra.instance().hydra
-        load_network(settings("dust3r"))
+        load("dust3r")
         assert GlobalHydra.instance().hydra is outer
 
 
 def test_nothing_is_downloaded_while_a_network_is_loaded(torch, no_network, tmp_path):
-    with loading.offline(torch):
+    with torch_network.offline(torch):
         with pytest.raises(OSError, match="clone the GitHub repository owner/name"):
             torch.hub.load("owner/name:v1", "entry")
         with pytest.raises(OSError, match="nothing is downloaded at run time"):
@@ -318,13 +261,59 @@ def test_nothing_is_downloaded_while_a_network_is_loaded(torch, no_network, tmp_
 
 
 def test_out_of_memory_names_the_window_and_what_to_lower(torch, framework):
-    data = framework[0]
-
-    class Exhausted(Loaded):
-        def __call__(self, views):
-            raise torch.cuda.OutOfMemoryError("tried to allocate 2 GiB")
+    def exhaust(*_):
+        raise torch.cuda.OutOfMemoryError("tried to allocate 2 GiB")
 
     with pytest.raises(ValueError, match="does not suffice for 3 images of 64x48") as raised:
-        ask(made(framework, Exhausted(Double(data)), "dust3r"), data)
+        ask(made(framework, "dust3r", exhaust)[0], framework[0])
     for part in ("slam.window_size", "prior.resolution", "memory_efficient", "XLA_PYTHON_CLIENT_PREALLOCATE"):
         assert part in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("shapes", "text"),
+    [
+        ({"head__weight": (2, 3)}, r"Missing key.* \"head.bias\""),
+        (
+            {"body__weight": (2, 3), "head__bias": (2,)},
+            r"Missing key.* \"head.weight\".*Unexpected key.* \"body.weight\"",
+        ),
+        (WEIGHTS | {"more": (1,)}, r"Unexpected key.* \"more\""),
+        ({"head__weight": (2, 4), "head__bias": (2,)}, "size mismatch for head.weight"),
+        (b"", "model.safetensors is damaged or no MapAnything's"),  # upstream says "header too large"
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\n", "Error while deserializing header"),
+    ],
+)
+def test_weights_that_leave_a_parameter_random_or_are_none_are_refused_by_name(framework, tmp_path, shapes, text):
+    """They were accepted: two runs predicted differently under one checksum. One of two names of a tensor is enough."""
+    clone(tmp_path / "hub")
+    folder = write_checkpoint(tmp_path / "weights", DINOV2)
+    write_weights(folder)
+    load(checkpoint=folder)
+    write_weights(folder, **shapes) if isinstance(shapes, dict) else (folder / "model.safetensors").write_bytes(shapes)
+    with pytest.raises(ValueError, match=rf"{text}.*: repeat hf download"):
+        load(checkpoint=folder)
+
+
+def test_a_wrapper_may_leave_weights_aside_but_must_not_lack_any_and_strictness_ends_with_the_loading(framework, torch):
+    """DUSt3R's wrapper loads MASt3R's file, which has more; both load without strictness."""
+    _, model, models = framework
+    own = {"weight": torch.zeros(1, 2), "bias": torch.zeros(1)}
+
+    def make(state):
+        def init(name, device):
+            torch.nn.Linear(2, 1).load_state_dict(state, strict=False)
+            return model
+
+        return init
+
+    before = torch.nn.Module.load_state_dict
+    models.init_model_from_config = make(own | {"head_local": torch.zeros(3)})
+    load("metric_dust3r")
+    models.init_model_from_config = make({"weight": torch.zeros(1, 2)})
+    with pytest.raises(ValueError, match=r"Linear lacks 1 of its weights, bias, .*MASt3R, metric"):
+        load("metric_dust3r")
+    with pytest.raises(RuntimeError), torch_network.whole_weights(torch):
+        assert torch.nn.Module.load_state_dict is not before
+        raise RuntimeError
+    assert torch.nn.Module.load_state_dict is before

@@ -15,11 +15,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from network_double import Sphere
-from network_stand_in import settings
+from network_stand_in import load
 
 from emgs_jax.prior.network.framework import MODELS, build_views
 from emgs_jax.prior.network.resize import plan_resize, resize_image
-from emgs_jax.prior.network.torch_network import load_network
 
 real_torch = pytest.importorskip("torch", reason="torch is not installed")
 models = pytest.importorskip("mapanything.models", reason="the package mapanything is not installed")
@@ -107,7 +106,7 @@ def test_the_wrapper_answers_with_geometry_and_twice_with_the_same_bits(make, mo
     monkeypatch.setattr(models, "init_model_from_config", configured)
     name = make.__name__
     monkeypatch.setitem(MODELS, name, replace(MODELS[name], needs_gpu=False))
-    network, data, resize = load_network(settings(name)), Sphere(num_frames=3, size=SIZE), plan_resize(SIZE, SIZE)
+    network, data, resize = load(name), Sphere(num_frames=3, size=SIZE), plan_resize(SIZE, SIZE)
     rng = np.random.default_rng(0)
     images = [resize_image(rng.integers(0, 256, (*SIZE[::-1], 3), np.uint8), resize) for _ in range(3)]
     first, second = (network.infer(build_views(images, data.intrinsics, resize, MODELS[name], None)) for _ in range(2))

@@ -12,22 +12,20 @@ from types import SimpleNamespace
 
 import hydra
 import jax
-import jaxlie
 import numpy as np
 import pytest
-from scene import compose, device, on_host
-from views import BESIDE, RANGE, camera, random_views, real_views
+from scene import compose
+from views import BESIDE, RANGE, asked, camera, random_views, real_views
 
-from emgs_jax.prior.pretrained.effimvs import SOURCE, build_network, estimate, extract
-from emgs_jax.prior.pretrained.matching import Sources
+from emgs_jax.prior.pretrained import effimvs
+from emgs_jax.prior.pretrained.effimvs import SOURCE, build_network
 from emgs_jax.prior.pretrained.weights import load_network
 
 ORIGINAL = Path(os.environ.get("EFFIMVS", BESIDE / "Effi-MVS-plus"))
 CHECKPOINT = ORIGINAL / "checkpoints/Effi_MVS_plus/model_tank.ckpt"
 SIZE = (128, 160)
-_extract = on_host(lambda network, images: jax.vmap(lambda image: extract(network, image))(images))
-_estimate = on_host(estimate)
 DENSE = hydra.utils.instantiate(compose("prior=multiview_stereo", "prior/dense=effimvs").prior.dense)
+found = asked(effimvs, DENSE.network)
 
 
 @pytest.fixture(scope="module")
@@ -35,15 +33,6 @@ def network():
     if not CHECKPOINT.is_file():
         pytest.skip(f"the published weights are not at {CHECKPOINT}")
     return load_network(str(CHECKPOINT), DENSE.sha256, SOURCE, "model", build_network)
-
-
-def found(network, images, T_source_view, depth_range=RANGE, is_used=None):
-    """Depth and confidence."""
-    kept = _extract(network, images)
-    view, others = (jax.tree.map(lambda leaf, rows=rows: leaf[rows], kept) for rows in (0, slice(1, None)))
-    used = np.ones(len(T_source_view), bool) if is_used is None else np.asarray(is_used)
-    sources = Sources(others, on_host(jaxlie.SE3.from_matrix)(device(T_source_view)), used)
-    return _estimate(network, view, sources, device(depth_range), camera(images.shape[1:3]), DENSE.network)
 
 
 def original(images, T_source_view):

@@ -3,11 +3,15 @@
 from pathlib import Path
 
 import cv2
+import jax
+import jaxlie
 import numpy as np
 import pytest
+from scene import device, on_host
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.ops.camera import Camera
+from emgs_jax.prior.sources import Sources
 
 BESIDE = Path(__file__).resolve().parents[3].parent
 SIZE, RANGE = (64, 96), (0.8, 5.0)  # rows and columns; nearest and farthest
@@ -16,6 +20,21 @@ SIZE, RANGE = (64, 96), (0.8, 5.0)  # rows and columns; nearest and farthest
 def camera(size=SIZE):
     height, width = size
     return Camera([0.82 * width, 1.09 * height], [0.5 * width - 0.5, 0.5 * height - 0.5], width, height)
+
+
+def asked(module, config):
+    """`found(network, images, T_source_view, …)`: depth and confidence of the first image, by a network's module."""
+    extract = on_host(lambda network, images: jax.vmap(lambda image: module.extract(network, image))(images))
+    estimate = on_host(module.estimate)
+
+    def found(network, images, T_source_view, depth_range=RANGE, is_used=None):
+        kept = extract(network, images)
+        view, others = (jax.tree.map(lambda leaf, rows=rows: leaf[rows], kept) for rows in (0, slice(1, None)))
+        used = np.ones(len(T_source_view), bool) if is_used is None else np.asarray(is_used)
+        sources = Sources(others, on_host(jaxlie.SE3.from_matrix)(device(T_source_view)), used)
+        return estimate(network, view, sources, device(depth_range), camera(images.shape[1:3]), config)
+
+    return found
 
 
 def random_views(size=SIZE, seed=0, count=4):

@@ -8,9 +8,9 @@ import pytest
 from emgs_jax.features.random import RandomFeatures
 from emgs_jax.features.text import save_text
 from emgs_jax.prior.base import Prior, windows
-from emgs_jax.prior.featured import Featured, Requeried
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.simulated.prior import Simulated
+from emgs_jax.prior.wrapped import Featured, Requeried
 
 WINDOW_SIZE = 3
 

@@ -2,7 +2,8 @@
 
 import numpy as np
 
-from emgs_jax.prior.pretrained.itermvs import IterMVS, build_network
+from emgs_jax.prior.pretrained.itermvs import build_network
+from emgs_jax.prior.pretrained.weights import Layers
 
 
 def _norm(channels: int) -> dict[str, tuple[int, ...]]:
@@ -68,5 +69,5 @@ def random_tensors(seed: int = 0) -> dict[str, np.ndarray]:
     return {name: draw(name, shape) for name, shape in _shapes().items()}
 
 
-def random_network(seed: int = 0) -> IterMVS:
+def random_network(seed: int = 0) -> Layers:
     return build_network(random_tensors(seed))

@@ -1,4 +1,4 @@
-"""Features for any prior: geometry from one model, features of the same images from another, text from a file."""
+"""Priors that answer as another one does, but for its features, their texts, or what masks leave out."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -16,19 +16,20 @@ class Wrapped(Prior):
     """A prior that answers as another one does, but for what a subclass changes."""
 
     def __init__(self, prior: Prior) -> None:
-        self._prior = prior
+        self._prior, self.provenance = prior, prior.provenance
+        self.feature_names, self.text_features = prior.feature_names, prior.text_features
 
     def num_newer(self, window_size: int) -> int:
         return self._prior.num_newer(window_size)
-
-    def check(self, dataset: Dataset, window_size: int) -> None:
-        self._prior.check(dataset, window_size)
 
     def keep(self, folder: Path) -> None:
         self._prior.keep(folder)
 
     def report(self) -> dict[str, float]:
         return self._prior.report()
+
+    def check(self, dataset: Dataset, window_size: int) -> None:
+        self._prior.check(dataset, window_size)
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         return self._prior.predict(window, frames, intrinsics)
@@ -40,10 +41,7 @@ class Wrapped(Prior):
 class Featured(Wrapped):
     """A prior whose predictions have the features of a feature model in place of their own.
 
-    Predictions of two visits keep the prior's own features: only geometry is needed there.
-
-    Args:
-        prior: for poses, points, confidence and mask, which are passed on unchanged.
+    Predictions of two visits keep the prior's own: only geometry is needed there.
     """
 
     def __init__(self, prior: Prior, model: FeatureModel) -> None:
@@ -81,12 +79,7 @@ class Featured(Wrapped):
 
 
 class Requeried(Wrapped):
-    """A prior with its own features and the text embeddings of a file.
-
-    Args:
-        prior: one whose features are a feature model's: live ones or recorded.
-        path: file of `experiments.embed` with the same model.
-    """
+    """A prior whose features are a feature model's, with the text embeddings of a file of `experiments.embed`."""
 
     def __init__(self, prior: Prior, path: str) -> None:
         super().__init__(prior)
@@ -100,3 +93,21 @@ class Requeried(Wrapped):
         self.feature_names, self.text_features = text.names, text.vectors
         settings = prior.provenance.settings | {"features": features | {"templates": [*text.templates]}}
         self.provenance = replace(prior.provenance, settings=settings)
+
+
+class Masked(Wrapped):
+    """A prior without a point where `Frame.mask` is."""
+
+    def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
+        return _without_masked(super().predict(window, frames, intrinsics), frames)
+
+    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
+        found = super().revisit(window, frames, intrinsics)
+        return None if found is None else _without_masked(found, frames)
+
+
+def _without_masked(prediction: PriorPrediction, frames: Sequence[Frame]) -> PriorPrediction:
+    masks = {frame.index: frame.mask for frame in frames}
+    dense = [masks[index] for index in prediction.window.dense]
+    is_out = np.stack([np.zeros(prediction.mask.shape[1:], bool) if mask is None else mask for mask in dense])
+    return replace(prediction, mask=prediction.mask & ~is_out)

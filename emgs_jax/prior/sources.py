@@ -1,27 +1,45 @@
-"""Choice of the other views that a view is matched against."""
+"""The other views that a view is matched or compared with, and their choice."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Bool, Float
 
+from emgs_jax.ops.pytree import stack
 from emgs_jax.structure.model import Structure
 
 
-def placed_beside(found: Structure, frame: int) -> np.ndarray:
+class Sources(NamedTuple):
+    """Other views.
+
+    Args:
+        views: what of them is compared, such as grey images in [0, 1], features or depths (m, 0 = none); batched.
+        T_source_view: view -> source, batched likewise.
+        is_used: sources that count.
+    """
+
+    views: Any
+    T_source_view: jaxlie.SE3
+    is_used: Bool[Array, "s"]
+
+
+def sources_of(found: Structure, frame: int, others: Sequence[int], count: int, view: Callable[[int], Any]) -> Sources:
+    """The first `count` of `others`; where they are fewer, they are repeated, and the repetitions do not count."""
+    is_used = np.arange(count) < len(others)
+    others, poses = (list(others) * count)[:count], found.T_world_camera
+    T = np.stack([np.linalg.inv(poses[other]) @ poses[frame] for other in others])
+    T_source_view = jaxlie.SE3.from_matrix(jnp.asarray(T, jnp.float32))
+    return Sources(stack([view(other) for other in others]), T_source_view, jnp.asarray(is_used))
+
+
+def placed_beside(found: Structure, frame: int) -> list[int]:
     """Frames of the same world that show landmarks, without this one, the nearest in time first."""
     others = np.flatnonzero((found.world == found.world[frame]) & found.is_placed)
     others = others[others != frame]
-    return others[np.argsort(np.abs(others - frame), kind="stable")]
-
-
-def relative(found: Structure, others: Sequence[int], frame: int) -> jaxlie.SE3:
-    """T_other_frame of several views."""
-    poses = found.T_world_camera
-    T = [np.linalg.inv(poses[other]) @ poses[frame] for other in others]
-    return jaxlie.SE3.from_matrix(jnp.asarray(np.stack(T), jnp.float32))
+    return others[np.argsort(np.abs(others - frame), kind="stable")].tolist()
 
 
 def parallax(

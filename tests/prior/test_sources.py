@@ -3,8 +3,20 @@
 from itertools import combinations
 
 import numpy as np
+from stereo_scene import matrix
 
-from emgs_jax.prior.multiview.sources import choose, parallax
+from emgs_jax.prior.sources import choose, parallax, sources_of
+from emgs_jax.structure.model import Structure
+
+
+def test_sources_have_their_poses_and_fewer_than_asked_for_are_repeated_without_counting():
+    poses = np.stack([matrix((0, 0.1 * row, 0), (row, 0, 0)) for row in range(3)])
+    found = Structure([], np.zeros(3, int), poses, np.zeros((3, 6, 6)), [np.arange(0)] * 3, np.zeros(3, bool))
+    sources = sources_of(found, 0, [2, 1], 3, lambda frame: np.full(2, frame))
+    np.testing.assert_array_equal(sources.views, [[2, 2], [1, 1], [2, 2]])
+    np.testing.assert_array_equal(sources.is_used, [True, True, False])
+    expected = np.linalg.inv(poses[[2, 1, 2]]) @ poses[0]
+    np.testing.assert_allclose(sources.T_source_view.as_matrix(), expected, atol=1e-6)
 
 
 def test_the_parallax_is_the_sine_of_the_angle_between_the_rays():
