@@ -65,13 +65,13 @@ def frame_size(width: int, height: int) -> tuple[int, int]:
 
 def _size(path: Path) -> tuple[int, int]:
     """(width, height) of a video or a folder of images, as they are shown."""
-    from emgs_jax.data.images import Folder
+    from emgs_jax.data.images import listed
+    from emgs_jax.data.reading import first_size
     from emgs_jax.data.video import VIDEO_SUFFIXES, Video
 
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
-        return Video(path, 1).find_size(range(1))
-    images = Folder(path)
-    return images.find_size(range(images.count))
+        return Video(path, 1).read(0).shape[1::-1]
+    return first_size(listed(path)[0], path)
 
 
 def _is_path(word: str, before: Sequence[str]) -> bool:
