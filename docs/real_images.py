@@ -28,8 +28,8 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.splats import draw
 from emgs_jax.render.composite import render
 from emgs_jax.report.colors import to_bytes
-from emgs_jax.report.display import closed
 from emgs_jax.report.finished_run import SPLATS_FILE, read_run, render_config
+from emgs_jax.report.layers import closed
 from emgs_jax.report.splats import read_splats
 
 TARGET = Path(__file__).with_name("real_images.jpg")

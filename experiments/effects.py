@@ -16,7 +16,7 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from emgs_jax.report.columns import MAIN, Column, Table, cell, markdown
+from emgs_jax.report.columns import MAIN, Column, Table, cell, in_unit, markdown
 from emgs_jax.report.sweeps import read_sweep
 
 from .command import command
@@ -136,7 +136,7 @@ def columns(alignment: str) -> list[Column]:
 
 def table(effects: Sequence[Effect], alignment: str = "protocol") -> str:
     """Markdown: for each sequence the metrics of its config, then what each changed value adds to them."""
-    shown, lines = columns(alignment), []
+    shown, lines = in_unit(columns(alignment), {effect.data.split()[0] for effect in effects}), []
     for effect in effects:
         change = "unchanged" if effect.key is None else f"{effect.key}={effect.value} (from {effect.own})"
         runs = max(map(len, effect.metrics.values()), default=0)

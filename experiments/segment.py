@@ -10,7 +10,7 @@ from omegaconf import DictConfig, ListConfig
 
 from emgs_jax.config.configure import build
 from emgs_jax.data.class_file import read_classes
-from emgs_jax.evaluation.segmentation import DistinctCells, LabelledPoints, label_cells, read_labelled_mesh, true_labels
+from emgs_jax.evaluation.segmentation import LabelledPoints, TrueLabels, read_labelled_mesh
 from emgs_jax.io.files import write_file, write_json
 from emgs_jax.report.finished_run import FinishedRun, read_run
 from emgs_jax.report.run_images import images_of
@@ -72,10 +72,10 @@ def true_points(config: DictConfig, run: FinishedRun, scene: str) -> LabelledPoi
     dataset, note = images_of(run)
     if dataset is None:
         raise ValueError(f"truth=frames: the frames of {run.folder} cannot be read again. {note}")
-    cells = DistinctCells()
+    labels = TrueLabels(dataset, config.voxel_m, config.max_depth_m)
     for row in range(len(dataset) if dataset.classes else 0):
-        cells.append(label_cells(dataset[row], dataset, config.voxel_m, config.max_depth_m))
-    truth = true_labels(cells, dataset, config.voxel_m)
+        labels.append(dataset[row])
+    truth = labels.points()
     if truth is None:
         raise ValueError(
             f"truth=frames: {dataset.name} {dataset.sequence} has no labelled frame with depth and pose: give "

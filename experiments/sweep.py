@@ -15,9 +15,7 @@ from omegaconf import DictConfig
 from emgs_jax.device.clock import Clock
 from emgs_jax.io.files import owned, write_file
 from emgs_jax.report.columns import csv_text
-from emgs_jax.report.heat_map import draw
-from emgs_jax.report.sweep_page import write_sweep_page
-from emgs_jax.report.sweeps import table
+from emgs_jax.report.sweep_page import draw, table, write_sweep_page
 
 from .command import command
 from .grid import notes, read_axes, variants
@@ -41,15 +39,15 @@ def sweep(config: DictConfig, folder: Path, command_line: str = "") -> list[dict
             print(f"going on: {len(grid) - num_done} of {len(grid)} settings are left")
         num_left = sequence.measure(grid)
         sequence.forget_predictions()
-    rows = sequence.rows([variant.setting for variant in grid])
+    rows, name = sequence.rows([variant.setting for variant in grid]), sequence.dataset.name
     write_file(folder / "sweep.csv", csv_text(rows))
     if config.grid == "product":  # else most cells of a picture would be empty
-        title = f"{sequence.dataset.name} {sequence.dataset.sequence}, {sequence.prior.provenance.name}"
-        no_picture = draw(folder / "heat_map.png", rows, axes, title)
+        title = f"{name} {sequence.dataset.sequence}, {sequence.prior.provenance.name}"
+        no_picture = draw(folder / "heat_map.png", rows, axes, title, name)
         if no_picture:
             print(f"no heat_map.png: {no_picture}")
     write_sweep_page(folder, sequence.provenance, rows, list(axes), command_line)
-    print(table(rows, list(axes)))
+    print(table(rows, list(axes), name))
     print(f"{num_left} settings in {clock.total_seconds:.1f} s, {clock.compile_seconds:.1f} s of it compilation")
     return rows
 

@@ -111,12 +111,12 @@ def _table(
     estimates: Sequence[Estimate], titles: Mapping[str, str], columns: Sequence[Column], is_best_bold: bool = False
 ) -> str:
     """A line for each data set, setting and kind; with `is_best_bold` the best of each data set and setting is bold."""
-    lines = []
-    for row in sorted(average(estimates, each_sequence=True), key=lambda row: list(titles).index(row.dataset)):
+    lines, rows = [], average(estimates, each_sequence=True)
+    for row in sorted(rows, key=lambda row: list(titles).index(row.dataset)):
         name = titles[row.dataset] + ("" if row.variant == "default" else f", {row.variant}")
         rivals = (row.dataset, row.variant) if is_best_bold else None
         lines.append(Line([name, row.kind, str(len(row.seeds))], row.values, row.spreads, rivals))
-    return markdown(metric_table(["data, setting", "", "runs"], columns, lines))
+    return markdown(metric_table(["data, setting", "", "runs"], columns, lines, {row.dataset for row in rows}))
 
 
 def _better(estimates: Sequence[Estimate]) -> str:

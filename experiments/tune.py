@@ -181,6 +181,7 @@ def _write(
     results = [
         SequenceResults(
             sequence.name,
+            sequence.dataset.name,
             kind == "held_out",
             sequence.prior.provenance.is_simulated,
             dict(zip(named, sequence.rows(list(named.values())), strict=True)),
@@ -196,7 +197,8 @@ def _write(
     _write_best(folder, best, lines)
     numbers = {row["trial"]: DEFAULT for row in rows if all(row[key] == own[key] for key in own)}
     marks = numbers | {number: f"trial {number}" for number in best}
-    no_picture = draw_trials(folder / "tune.png", rows, objectives, marks, "means over the tuned sequences")
+    title, data = "means over the tuned sequences", {sequence.dataset.name for sequence in sequences["tuned"]}
+    no_picture = draw_trials(folder / "tune.png", rows, objectives, marks, title, data)
     if no_picture:
         print(f"no tune.png: {no_picture}")
     print(text)

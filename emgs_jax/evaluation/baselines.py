@@ -6,7 +6,7 @@ Lengths are those of the poses; sizes in metres become such lengths by the unit 
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
@@ -22,15 +22,10 @@ Draw = Callable[[np.ndarray], Image]  # from the pose T_world_camera (4, 4)
 
 @dataclass(frozen=True)
 class View:
-    """Prediction of one frame, in the frame of its camera and the prior's own lengths.
+    """Prediction of one frame, in the frame of its camera and the prior's own lengths."""
 
-    Args:
-        depth: camera-space z (h, w), 0 where there is none.
-        image: RGB, uint8 (h, w, 3).
-    """
-
-    depth: np.ndarray
-    image: np.ndarray
+    depth: np.ndarray  # camera-space z (h, w), 0 where there is none
+    image: np.ndarray  # RGB, uint8 (h, w, 3)
     cloud: PointCloud
 
 
@@ -43,42 +38,18 @@ class Pinhole:
     height: int
 
 
-class Fusion(Protocol):
-    """A reconstruction that grows by views."""
-
-    def add(self, view: View, T_world_camera: np.ndarray, scale: float) -> None:
-        """Add a view at a pose; `scale` brings its lengths to those of the pose."""
-        ...
-
-    def cloud(self) -> PointCloud:
-        """Return the cloud that is fused so far, with normals towards the cameras."""
-        ...
-
-    def renderer(self) -> Draw:
-        """Draws what there is so far."""
-        ...
-
-
 @dataclass(frozen=True)
 class VoxelConfig:
-    """The mean of all points of each voxel.
-
-    Args:
-        max_footprint_px: a point is drawn as the square that its voxel covers, but at most so far to each side: what
-            lies just before the camera would fill the image.
-        surface_depth: see `draw_voxels`.
-        min_points: likewise.
-    """
+    """The mean of all points of each voxel; see `draw_voxels`."""
 
     voxel_m: float = number(low=1e-6)
+    # A point is drawn as the square that its voxel covers, but at most so far to each side: what lies just before the
+    # camera would fill the image.
     max_footprint_px: int = number(low=1, high=4096)
     surface_depth: float = number(low=0)
     min_points: int = number(low=1)
 
-    def __post_init__(self) -> None:
-        _require_positive("voxel", voxel_m=self.voxel_m, max_footprint_px=self.max_footprint_px)
-
-    def start(self, pinhole: Pinhole, unit: float) -> Fusion:
+    def start(self, pinhole: Pinhole, unit: float) -> "Fusion":
         """Without any view; a length of the poses is `unit` metres."""
         return _Voxels(replace(self, voxel_m=self.voxel_m / unit), pinhole)
 
@@ -89,25 +60,20 @@ class TsdfConfig:
 
     Behind a depth edge the field of the front surface is written into free space as far as the truncation reaches, and
     surfaces nearer to each other than that disturb each other.
-
-    Args:
-        truncation_m: distance at which the field ends; a few voxels, and more than the noise of the depth.
-        min_views: that must have seen a place.
     """
 
     voxel_m: float = number(low=1e-6)
-    truncation_m: float = number(low=1e-6)
-    min_views: int = number(low=1)
+    truncation_m: float = number(low=1e-6)  # where the field ends; a few voxels, and more than the noise of the depth
+    min_views: int = number(low=1)  # that must have seen a place
 
     def __post_init__(self) -> None:
-        _require_positive("tsdf", voxel_m=self.voxel_m, truncation_m=self.truncation_m, min_views=self.min_views)
         if self.truncation_m < self.voxel_m:
             raise ValueError(
                 f"baseline.tsdf.truncation_m={self.truncation_m} is less than one voxel ({self.voxel_m}): no surface "
                 "would be found; take some voxels"
             )
 
-    def start(self, pinhole: Pinhole, unit: float) -> Fusion:
+    def start(self, pinhole: Pinhole, unit: float) -> "Fusion":
         """Without any view; a length of the poses is `unit` metres."""
         lengths = replace(self, voxel_m=self.voxel_m / unit, truncation_m=self.truncation_m / unit)
         return _Tsdf(lengths, pinhole)
@@ -117,17 +83,22 @@ BaselineConfig = VoxelConfig | TsdfConfig
 
 
 class _Voxels:
+    """A reconstruction that grows by views."""
+
     def __init__(self, config: VoxelConfig, pinhole: Pinhole) -> None:
         self._config, self._pinhole, self._points = config, pinhole, SpooledCloud()
 
     def add(self, view: View, T_world_camera: np.ndarray, scale: float) -> None:
+        """Add a view at a pose; `scale` brings its lengths to those of the pose."""
         motion = Sim3(scale, T_world_camera[:3, :3], T_world_camera[:3, 3])
         self._points.append(transform_cloud(view.cloud, motion))
 
     def cloud(self) -> PointCloud:
+        """The cloud that is fused so far, with normals towards the cameras."""
         return self._points.averaged(self._config.voxel_m).cloud()
 
     def renderer(self) -> Draw:
+        """Draws what there is so far."""
         means = self._points.averaged(self._config.voxel_m)
         blocks = _Blocks(means.cloud(), means.counts(), _BLOCK_VOXELS * self._config.voxel_m)
 
@@ -140,6 +111,8 @@ class _Voxels:
 
 
 class _Tsdf:
+    """Another one, with the same methods."""
+
     _BLOCK, _BLOCKS = 8, 2000  # voxels a side, and blocks to begin with: there is more memory where it is needed
     # In voxels. Open3D finds no surface where the field is exactly 0 at a voxel, as for a wall at a round distance.
     _SHIFT = 0.37
@@ -179,10 +152,8 @@ class _Tsdf:
         return PointCloud(*(values[order] for values in rows))
 
     def renderer(self) -> Draw:
-        if not self._grid.hashmap().size():
-            return lambda T: _nothing(self._pinhole)
-        mesh = self._grid.extract_triangle_mesh(self._threshold)
-        if not len(mesh.triangle.indices):
+        mesh = self._grid.extract_triangle_mesh(self._threshold) if self._grid.hashmap().size() else None
+        if mesh is None or not len(mesh.triangle.indices):
             return lambda T: _nothing(self._pinhole)
         scene = self._o3d.t.geometry.RaycastingScene()
         scene.add_triangles(mesh)
@@ -215,6 +186,9 @@ class _Tsdf:
         return self._o3d.core.Tensor(np.asarray(values, np.float64))
 
 
+Fusion = _Voxels | _Tsdf
+
+
 class _Blocks:
     """Points of a cloud by cubes of the world, of which a camera sees few: a view costs what it shows."""
 
@@ -232,11 +206,9 @@ class _Blocks:
         is_near = centers[:, 2] > -radius
         fx, fy, cx, cy = pinhole.intrinsics
         margin = config.max_footprint_px + 1.0
-        for axis, focal, low, high in (
-            (0, fx, -margin - cx, pinhole.width + margin - cx),
-            (1, fy, -margin - cy, pinhole.height + margin - cy),
-        ):
-            for end, sign in ((low, 1.0), (high, -1.0)):  # planes through the camera, along the sides of the image
+        for axis, focal, center, size in ((0, fx, cx, pinhole.width), (1, fy, cy, pinhole.height)):
+            # Planes through the camera, along the sides of the image.
+            for end, sign in ((-margin - center, 1.0), (size + margin - center, -1.0)):
                 inside = sign * (focal * centers[:, axis] - end * centers[:, 2])
                 is_near &= inside >= -radius * np.hypot(focal, end)
         return np.sort(np.concatenate([np.empty(0, np.int64), *(self._parts[i] for i in np.flatnonzero(is_near))]))
@@ -304,9 +276,3 @@ def _front(
 
 def _nothing(pinhole: Pinhole) -> Image:
     return np.zeros((pinhole.height, pinhole.width)), np.zeros((pinhole.height, pinhole.width, 3))
-
-
-def _require_positive(name: str, **values: float) -> None:
-    for key, value in values.items():
-        if not value > 0:
-            raise ValueError(f"baseline.{name}.{key} must be positive, got {value}")

@@ -2,7 +2,7 @@
 
 import os
 import threading
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,17 +23,11 @@ SOME = 61  # every so manieth point says where a cloud is divided
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points with attributes; float64 rows. A normal of zero is unknown and left out of the normal metrics.
+    """Points with attributes; float64 rows. A normal of zero is unknown and left out of the normal metrics."""
 
-    Args:
-        points: (n, 3), metres.
-        normals: (n, 3), unit length and towards the camera that saw them, or zero.
-        colors: (n, 3), RGB in [0, 1].
-    """
-
-    points: np.ndarray
-    normals: np.ndarray
-    colors: np.ndarray
+    points: np.ndarray  # (n, 3), metres
+    normals: np.ndarray  # (n, 3), unit length and towards the camera that saw them, or zero
+    colors: np.ndarray  # (n, 3), RGB in [0, 1]
 
     def __len__(self) -> int:
         return len(self.points)
@@ -100,14 +94,12 @@ def transform_cloud(cloud: PointCloud, alignment: Sim3) -> PointCloud:
 class VoxelMeans:
     """The mean of each occupied voxel of a cloud, in parts that need not be in memory together.
 
-    Args:
-        parts: rows (n, 10) by the number of their cell, in one part and from part to part: point, normal (unit length,
-            or zero), colour, and how many points there were.
-        sizes: rows of each part.
+    A part has rows (n, 10): point, normal (unit length, or zero), colour, and how many points there were. They are by
+    the number of their cell, in one part and from part to part.
     """
 
     parts: Spool
-    sizes: tuple[int, ...]
+    sizes: tuple[int, ...]  # rows of each part
 
     def __len__(self) -> int:
         return sum(self.sizes)
@@ -121,10 +113,12 @@ class VoxelMeans:
 
     def rows(self, positions: np.ndarray) -> np.ndarray:
         """Rows (m, 10) at positions (m,) in ascending order."""
-        ends = np.searchsorted(positions, np.cumsum(self.sizes))
-        chosen = np.split(positions, ends[:-1]) if self.sizes else []
         begins = np.cumsum((0, *self.sizes))
-        found = [part[rows - begin] for part, rows, begin in zip(self.tables(), chosen, begins, strict=False)]
+        ends = np.searchsorted(positions, begins)
+        found = [
+            part[positions[first:last] - begin]
+            for part, begin, first, last in zip(self.tables(), begins, ends, ends[1:], strict=False)
+        ]
         return np.concatenate([np.empty((0, 10), np.float32), *found])
 
     def cloud(self) -> PointCloud:
@@ -136,36 +130,75 @@ class VoxelMeans:
         return np.concatenate([np.empty(0), *(part[:, 9] for part in self.tables())])
 
 
-class SpooledCloud:
-    """All points of many clouds, in a temporary file, averaged once the side of a voxel is known.
+class SpooledRows:
+    """Rows (n, c) that begin with a place, in a temporary file, until the side of a voxel is known.
 
     What is not metric has a unit that only its alignment tells: 1 cm of the truth is .01 of one estimate's lengths and
-    .00001 of another's. Rows (n, 9) of `dtype` a cloud; points that are not finite are dropped.
+    .00001 of another's. Rows without a finite place are dropped.
     """
 
     def __init__(self, dtype: type = np.float32) -> None:
         self._parts, self._some, self._count, self._dtype = Spool(), [np.empty((0, 3), dtype)], 0, dtype
+
+    def append(self, rows: np.ndarray) -> None:
+        """Add some rows."""
+        rows = rows[np.isfinite(rows[:, :3]).all(axis=1)].astype(self._dtype)
+        self._parts.append(rows)
+        self._some.append(rows[::SOME, :3].copy())
+        self._count += len(rows)
+
+    def __len__(self) -> int:
+        return self._count
+
+    def by_ranges(self, voxel: float, read: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Iterator:
+        """What `read` makes of the rows, one range of cells of the world grid after the other.
+
+        What is in one range is in memory at a time, about `PART_ROWS` rows, in the order in which it was added.
+
+        Args:
+            voxel: side of a cell.
+            read: of rows that were added together: the numbers of their cells, and what is given back of them.
+        """
+        numbers, num_parts = np.sort(cell_numbers(np.concatenate(self._some), voxel)), -(-len(self) // PART_ROWS)
+        edges = numbers[len(numbers) * np.arange(1, num_parts) // max(num_parts, 1)]
+        spread, places = Spool(), [[] for _ in range(len(edges) + 1)]
+        for part in range(len(self._parts)):
+            cells, rows = read(self._parts[part])
+            which = np.searchsorted(edges, cells, side="right")
+            order = np.argsort(which, kind="stable")
+            ends = np.cumsum(np.bincount(which, minlength=len(places)))
+            for place, own in zip(places, np.split(order, ends[:-1]), strict=True):
+                if len(own):
+                    place.append(spread.append(rows[own]))
+        for place in filter(None, places):
+            yield np.concatenate([spread[position] for position in place])
+
+
+class SpooledCloud:
+    """All points of many clouds as `SpooledRows` (n, 9) of `dtype`: point, normal, colour."""
+
+    def __init__(self, dtype: type = np.float32) -> None:
+        self._rows = SpooledRows(dtype)
         self._averaged: tuple[float, VoxelMeans] | None = None  # the last answer: one alignment serves several numbers
         self._averaging = threading.Lock()
 
     def append(self, cloud: PointCloud) -> None:
         """Add the points of a cloud."""
-        rows = np.concatenate([cloud.points, cloud.normals, cloud.colors], axis=1)
-        rows = rows[np.isfinite(rows[:, :3]).all(axis=1)].astype(self._dtype)
-        self._parts.append(rows)
-        self._some.append(rows[::SOME, :3].copy())
-        self._count, self._averaged = self._count + len(rows), None
+        self._rows.append(np.concatenate([cloud.points, cloud.normals, cloud.colors], axis=1))
+        self._averaged = None
 
     def __len__(self) -> int:
-        return self._count
+        return len(self._rows)
 
     def averaged(self, voxel: float) -> VoxelMeans:
         """The means of all points of each voxel [lengths of the clouds] of the world grid, however they were spread."""
         with self._averaging:
             if self._averaged is None or self._averaged[0] != voxel:
-                parts = (self._parts[row] for row in range(len(self._parts)))
-                edges = cell_edges(np.concatenate(self._some), len(self), voxel)
-                self._averaged = voxel, _average(parts, edges, voxel)
+                means, sizes = Spool(), []
+                for rows in self._rows.by_ranges(voxel, lambda rows: (cell_numbers(rows[:, :3], voxel), rows)):
+                    means.append(found := _means(rows, voxel))
+                    sizes.append(len(found))
+                self._averaged = voxel, VoxelMeans(means, tuple(sizes))
             return self._averaged[1]
 
 
@@ -253,53 +286,6 @@ def register(points: np.ndarray, target: NearestPoints, max_distance: float, max
 
 def _cloud(rows: np.ndarray) -> PointCloud:
     return PointCloud(*(rows[:, begin : begin + 3].astype(np.float64) for begin in (0, 3, 6)))
-
-
-def cell_edges(some: np.ndarray, count: int, voxel: float) -> np.ndarray:
-    """Numbers of the cells that part `count` points into ranges of about `PART_ROWS`, as `some` (n, 3) are spread."""
-    numbers, num_parts = np.sort(cell_numbers(some, voxel)), -(-count // PART_ROWS)
-    return numbers[len(numbers) * np.arange(1, num_parts) // max(num_parts, 1)]
-
-
-def by_ranges(parts: Iterable[tuple[np.ndarray, np.ndarray]], edges: np.ndarray) -> Iterator[np.ndarray]:
-    """Rows of the cells between two `edges`, one range after the other: those of one are in memory at a time.
-
-    Args:
-        parts: numbers of the cells of some rows, and the rows; in this order they are given back.
-    """
-    spread, places = Spool(), [[] for _ in range(len(edges) + 1)]
-    for cells, rows in parts:
-        which = np.searchsorted(edges, cells, side="right")
-        order = np.argsort(which, kind="stable")
-        ends = np.cumsum(np.bincount(which, minlength=len(places)))
-        for place, own in zip(places, np.split(order, ends[:-1]), strict=True):
-            if len(own):
-                place.append(spread.append(rows[own]))
-    for place in filter(None, places):
-        yield np.concatenate([spread[position] for position in place])
-
-
-def _average(parts: Iterator[np.ndarray], edges: np.ndarray, voxel: float) -> VoxelMeans:
-    """Average rows (n, 9) per voxel."""
-    found, sizes = Spool(), []
-    for rows in by_ranges(((cell_numbers(rows[:, :3], voxel), rows) for rows in _batches(parts)), edges):
-        means = _means(rows, voxel)
-        found.append(means)
-        sizes.append(len(means))
-    return VoxelMeans(found, tuple(sizes))
-
-
-def _batches(parts: Iterator[np.ndarray]) -> Iterator[np.ndarray]:
-    """Rows of one part after the other, about `PART_ROWS` together."""
-    pending: list[np.ndarray] = []
-    for part in parts:
-        for begin in range(0, len(part), PART_ROWS):
-            pending.append(part[begin : begin + PART_ROWS])
-            if sum(map(len, pending)) >= PART_ROWS:
-                yield np.concatenate(pending)
-                pending = []
-    if pending:
-        yield np.concatenate(pending)
 
 
 def _means(rows: np.ndarray, voxel: float) -> np.ndarray:

@@ -10,27 +10,18 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class InstanceConfig:
-    """Clustering of a query's answers into objects (DBSCAN).
+    """Clustering of a query's answers into objects (DBSCAN): those within reach of each other are one."""
 
-    Args:
-        reach: in median distances between nearest Gaussians of the map; answers within it of each other are one object.
-        min_gaussians: within `reach` of a Gaussian, itself included, that hold a cluster together (DBSCAN's minPts).
-    """
-
-    reach: float = number(low=1e-6, high=1e6)
-    min_gaussians: int = number(low=1, high=10**6)
+    reach: float = number(low=1e-6, high=1e6)  # in median distances between nearest Gaussians of the map
+    min_gaussians: int = number(low=1, high=10**6)  # within `reach` of one, itself included: DBSCAN's minPts
 
 
 @dataclass(frozen=True)
 class Instance:
-    """One object, in the frame and unit of the map.
-
-    Args:
-        low: lower corner of the box along the map's axes that holds its Gaussians' means with one standard deviation.
-    """
+    """One object, in the frame and unit of the map."""
 
     center: np.ndarray
-    low: np.ndarray
+    low: np.ndarray  # of the box along the map's axes that holds its Gaussians' means with one standard deviation
     high: np.ndarray
     score: float
     lead: float
@@ -76,7 +67,6 @@ def find_instances(
         rows = answers[numbers == one]
         spread = np.sqrt(np.diagonal(covs[rows], axis1=1, axis2=2))
         low, high = (means[rows] - spread).min(0), (means[rows] + spread).max(0)
-        found.append(
-            Instance(means[rows].mean(0), low, high, float(cosines[rows].mean()), float(leads[rows].mean()), rows)
-        )
+        score, lead = float(cosines[rows].mean()), float(leads[rows].mean())
+        found.append(Instance(means[rows].mean(0), low, high, score, lead, rows))
     return sorted(found, key=lambda one: -one.score * len(one.rows))

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from emgs_jax.evaluation.trajectory import rotation_angles
+from emgs_jax.geometry import pose_difference
 
 MAX_GAP_M = 0.15  # layers farther apart may be two surfaces
 MAX_GAP = 4.0  # likewise where metres are not known, as a multiple of how far Gaussians stand apart
@@ -31,10 +31,10 @@ def loop_metrics(
         truth: T_world_camera (4, 4) of every frame; None where unknown.
         min_gap: frames between a place and a return to it.
     """
-    judged = [(b, _is_right(measured, truth[a], truth[b])) for a, b, measured in loops if _known(truth, a, b)]
-    right = [b for b, is_right in judged if is_right]
+    judged = [loop for loop in loops if truth[loop[0]] is not None and truth[loop[1]] is not None]
+    right = [b for a, b, measured in judged if _is_right(measured, truth[a], truth[b])]
+    unjudged = [b for a, b, _ in loops if truth[a] is None or truth[b] is None]
     returning = _returning(truth, min_gap)
-    unjudged = [b for a, b, _ in loops if not _known(truth, a, b)]
     found = [_is_near(row, right) for row in returning if _is_near(row, right) or not _is_near(row, unjudged)]
     return {
         "loops/precision": len(right) / len(judged) if judged else None,
@@ -47,29 +47,21 @@ def _is_near(row: int, frames: Sequence[int]) -> bool:
     return any(abs(row - frame) <= REACH for frame in frames)
 
 
-def _known(truth: Sequence[np.ndarray | None], *rows: int) -> bool:
-    return all(truth[row] is not None for row in rows)
-
-
 def _is_right(measured: np.ndarray, true_a: np.ndarray, true_b: np.ndarray) -> bool:
-    error = np.linalg.inv(np.linalg.inv(true_a) @ true_b) @ measured
-    angle = np.degrees(rotation_angles(error[None, :3, :3]))[0]
-    return bool(np.linalg.norm(error[:3, 3]) <= RIGHT_M and angle <= RIGHT_DEG)
+    distance, angle = pose_difference(np.linalg.inv(true_a) @ true_b, measured)
+    return bool(distance <= RIGHT_M and angle <= RIGHT_DEG)
 
 
 def _returning(truth: Sequence[np.ndarray | None], min_gap: int) -> list[int]:
     """Frames that see a place again."""
-    rows = np.array([row for row, pose in enumerate(truth) if pose is not None], int)
-    if not len(rows):
-        return []
-    poses = np.stack([truth[row] for row in rows])
-    found = []
-    for position, row in enumerate(rows):
-        older = poses[rows <= row - min_gap]
-        near = np.linalg.norm(older[:, :3, 3] - poses[position, :3, 3], axis=1) <= PLACE_M
-        turned = rotation_angles(np.swapaxes(older[near, :3, :3], 1, 2) @ poses[position, :3, :3])
-        if (np.degrees(turned) <= PLACE_DEG).any():
-            found.append(int(row))
+    rows, found = [row for row, pose in enumerate(truth) if pose is not None], []
+    poses = np.array([truth[row] for row in rows])
+    for row in rows:
+        older = poses[: np.searchsorted(rows, row - min_gap, side="right")]
+        if len(older):
+            distances, angles = pose_difference(truth[row], older)
+            if ((distances <= PLACE_M) & (angles <= PLACE_DEG)).any():
+                found.append(row)
     return found
 
 
@@ -110,11 +102,7 @@ def double_wall_share(
 
 
 def _is_behind(
-    offset: np.ndarray,
-    normal: np.ndarray,
-    covs: tuple[np.ndarray, np.ndarray],
-    spacing: float,
-    max_gap: float,
+    offset: np.ndarray, normal: np.ndarray, covs: tuple[np.ndarray, np.ndarray], spacing: float, max_gap: float
 ) -> np.ndarray:
     """Test pairs (n,) for two layers, by their distance (n, 3), a normal of both (n, 3) and covariances (n, 3, 3)."""
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)

@@ -5,14 +5,25 @@ One scene gives a confusion matrix, int64 (c, c + 1) as in `segmentation`; scene
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 
 from emgs_jax.evaluation.clouds import NearestPoints
-from emgs_jax.evaluation.segmentation import LabelledPoints, confusion_matrix, segmentation_metrics, transfer_labels
+from emgs_jax.evaluation.segmentation import (
+    LabelledPoints,
+    confusion_matrix,
+    most_seen,
+    segmentation_metrics,
+    transfer_labels,
+)
 from emgs_jax.ops.ranges import number
 
 NAMES = ("miou", "fmiou", "acc")
+
+
+def _one_of(*names: str) -> Any:
+    return field(metadata={"choices": names})
 
 
 @dataclass(frozen=True)
@@ -38,33 +49,22 @@ class SegmentationProtocol:
     """
 
     name: str
-    compared_at: str
+    compared_at: str = _one_of("truth", "map")
     num_neighbours: int = number(low=1, high=1000)
     none_votes: bool = field()
     voxel_m: float = number(low=0, high=1000)
-    offered: str = field()
+    offered: str = _one_of("all", "kept", "scene")
     ignored: list[str] = field()
     logit_scale: float = number(low=1e-6, high=1e6)
     min_probability: float = number(low=0, high=1)
     min_class_probability: float = number(low=0, high=1)
-    counted: str = field()
-    scenes: str = field()
-    accuracy: str = field()
-
-    def __post_init__(self):
-        choices = {
-            "compared_at": ("truth", "map"),
-            "offered": ("all", "kept", "scene"),
-            "counted": ("seen", "in_truth"),
-        }
-        choices |= {"scenes": ("sum", "mean"), "accuracy": ("mean_recall", "overall")}
-        for key, allowed in choices.items():
-            if getattr(self, key) not in allowed:
-                raise ValueError(f"protocol.{key} must be {' or '.join(allowed)}, got {getattr(self, key)!r}")
+    counted: str = _one_of("seen", "in_truth")
+    scenes: str = _one_of("sum", "mean")
+    accuracy: str = _one_of("mean_recall", "overall")
 
 
 def ignored_positions(classes: Sequence[str], protocol: SegmentationProtocol) -> list[int]:
-    """Return the positions of the protocol's ignored names among the classes; names that are no classes are skipped."""
+    """The positions of the protocol's ignored names among the classes; names that are no classes are skipped."""
     return [position for position, name in enumerate(classes) if name in protocol.ignored]
 
 
@@ -102,14 +102,13 @@ def scene_confusion(
     points, labels = voxel_labels(found.points, found.labels, p.voxel_m)
     true_points, true = voxel_labels(truth.points, true, p.voxel_m)
     if not len(points) or not len(true_points):
-        predicted, compared = np.full(len(true), -1), true
+        labels = np.full(len(true), -1)
     elif p.compared_at == "map":
-        predicted, compared = labels, true[NearestPoints(true_points).query(points)[1][:, 0]]
-    elif p.none_votes:
-        predicted, compared = transfer_labels(points, labels + 1, true_points, p.num_neighbours) - 1, true
+        true = true[NearestPoints(true_points).query(points)[1][:, 0]]
     else:
-        predicted, compared = transfer_labels(points, labels, true_points, p.num_neighbours), true
-    return confusion_matrix(compared, predicted, len(truth.classes))
+        none = int(p.none_votes)  # a class of its own, or left out
+        labels = transfer_labels(points, labels + none, true_points, p.num_neighbours) - none
+    return confusion_matrix(true, labels, len(truth.classes))
 
 
 def voxel_labels(points: np.ndarray, labels: np.ndarray, voxel: float) -> tuple[np.ndarray, np.ndarray]:
@@ -120,10 +119,7 @@ def voxel_labels(points: np.ndarray, labels: np.ndarray, voxel: float) -> tuple[
     if voxel <= 0 or not len(points):
         return points, labels
     cells, voxels = np.unique(np.rint(points / voxel).astype(np.int64), axis=0, return_inverse=True)
-    pairs, counts = np.unique(np.column_stack([voxels.ravel(), labels]), axis=0, return_counts=True)
-    order = np.lexsort((pairs[:, 1], -counts, pairs[:, 0]))
-    first = np.unique(pairs[order, 0], return_index=True)[1]
-    return cells * voxel, pairs[order][first, 1]
+    return cells * voxel, most_seen(np.column_stack([labels, voxels.ravel()]))[:, 0]
 
 
 def table_metrics(
@@ -146,6 +142,5 @@ def matrix_metrics(confusion: np.ndarray, ignored: Sequence[int], p: Segmentatio
             confusion = confusion.copy()
             confusion[:, ignored] = 0
     found = segmentation_metrics(confusion, ignored)
-    accuracy = "mean_recall" if p.accuracy == "mean_recall" else "accuracy"
-    keys = ("miou", "fmiou", accuracy)
+    keys = ("miou", "fmiou", "mean_recall" if p.accuracy == "mean_recall" else "accuracy")
     return {name: found[f"segmentation/{key}_percent"] for name, key in zip(NAMES, keys, strict=True)}

@@ -1,8 +1,9 @@
 """Distance of a reconstructed cloud from the true one: building both clouds, accuracy, completion, F1, normals."""
 
+import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -34,8 +35,8 @@ class EvaluationConfig:
     """The protocol of a comparison; it is written into every result. Values: conf/evaluation."""
 
     protocol: str
-    alignment: str  # "sim3", or "se3": without the scale
-    statistic: str  # "mean" or "rmse" of the distances
+    alignment: str = field(metadata={"choices": ("sim3", "se3")})  # se3: without the scale
+    statistic: str = field(metadata={"choices": ("mean", "rmse")})  # of the distances
     max_distance_m: float = number(low=1e-6, high=math.inf)  # longer distances count as this long; F1 does not change
     max_depth_m: float = number(low=1e-6, high=math.inf)  # true depth farther away is left out
     icp_distance_m: float = number(low=0)  # ICP after the alignment takes pairs within this distance; 0 = no ICP
@@ -54,15 +55,6 @@ class EvaluationConfig:
     min_normal_taps: int = number(low=3, high=1000)
     label_neighbours: int = number(low=1, high=1000)  # nearest points of the map that vote for a true point's label
 
-    def __post_init__(self):
-        object.__setattr__(self, "f1_thresholds_m", tuple(float(value) for value in self.f1_thresholds_m))
-        for name, choices in (("alignment", ("sim3", "se3")), ("statistic", ("mean", "rmse"))):
-            if getattr(self, name) not in choices:
-                raise ValueError(f"evaluation.{name} must be {' or '.join(choices)}, got {getattr(self, name)!r}")
-        for name in ("voxel_m", "icp_voxel_m", "placement_icp_m", "max_distance_m", "max_depth_m"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"evaluation.{name} must be positive, got {getattr(self, name)}")
-
 
 def window_normals(points: np.ndarray, valid: np.ndarray, config: EvaluationConfig) -> np.ndarray:
     """Fit a plane to the window around each pixel of a camera-frame point map (h, w, 3), in camera frame.
@@ -75,10 +67,9 @@ def window_normals(points: np.ndarray, valid: np.ndarray, config: EvaluationConf
     z = np.where(valid, points[..., 2], 1.0).astype(np.float32)
     samples = np.stack([points[..., 0] / z, points[..., 1] / z, 1.0 / z]).astype(np.float32)
     samples = np.where(valid, samples, 0.0)
-    gaps = config.max_normal_gap * samples[2]
-    slopes, offset, _ = _fit_planes(samples, valid, (np.zeros_like(samples[:2]), np.zeros_like(z), gaps), config)
-    gaps = config.max_normal_residual * samples[2]
-    slopes, offset, good = _fit_planes(samples, valid, (slopes, offset, gaps), config)
+    slopes, offset = np.zeros_like(samples[:2]), np.zeros_like(z)
+    for max_gap in (config.max_normal_gap, config.max_normal_residual):
+        slopes, offset, good = _fit_planes(samples, valid, slopes, offset, max_gap * samples[2], config)
     # samples[2] + offset is the plane's inverse depth at the centre: (slopes, c) · p = 1 for every p on the plane.
     c = samples[2] + offset - slopes[0] * samples[0] - slopes[1] * samples[1]
     normals = -np.stack([slopes[0], slopes[1], c], -1)
@@ -87,15 +78,8 @@ def window_normals(points: np.ndarray, valid: np.ndarray, config: EvaluationConf
     return np.where(good[..., None], normals / np.where(good, length, 1.0)[..., None], 0.0)
 
 
-def posed_cloud(
-    points: np.ndarray, mask: np.ndarray, image: np.ndarray, T_world_camera: np.ndarray, config: EvaluationConfig
-) -> PointCloud:
-    """Turn a camera-frame point map (h, w, 3) with its image, uint8 (h, w, 3), into a cloud in the world."""
-    return posed(camera_cloud(points, mask, image, config), T_world_camera)
-
-
 def camera_cloud(points: np.ndarray, mask: np.ndarray, image: np.ndarray, config: EvaluationConfig) -> PointCloud:
-    """The same in the frame of the camera."""
+    """Turn a camera-frame point map (h, w, 3) with its image, uint8 (h, w, 3), into a cloud in that frame."""
     mask = mask & np.isfinite(points).all(-1)
     normals = window_normals(points, mask, config)[mask].astype(np.float64)
     return PointCloud(points[mask].astype(np.float64), normals, image[mask] / 255.0)
@@ -116,31 +100,26 @@ def ground_truth_cloud(
             if frame.depth is not None and frame.T_world_camera is not None:
                 depth = frame.static_depth
                 known = (depth > 0) & (depth <= config.max_depth_m)
-                points = backproject(depth, intrinsics)
-                yield posed_cloud(points, known, frame.image, frame.T_world_camera, config)
+                yield posed(
+                    camera_cloud(backproject(depth, intrinsics), known, frame.image, config), frame.T_world_camera
+                )
 
     return fuse_clouds(clouds(), config.voxel_m)
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The true cloud as a protocol compares with it, made once for all estimates.
+    """The true cloud as a protocol compares with it, made once for all estimates."""
 
-    Args:
-        cloud: averaged per voxel.
-    """
-
-    cloud: PointCloud
+    cloud: PointCloud  # averaged per voxel
     points: NearestPoints
     icp_points: NearestPoints
 
 
 def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
     """Prepare a true cloud for comparisons under `config`, with either alignment and with or without ICP."""
-    cloud = voxel_downsample(truth, config.voxel_m)
-    return Reference(
-        cloud, NearestPoints(cloud.points), NearestPoints(voxel_downsample(truth, config.icp_voxel_m).points)
-    )
+    cloud, coarse = (voxel_downsample(truth, voxel) for voxel in (config.voxel_m, config.icp_voxel_m))
+    return Reference(cloud, NearestPoints(cloud.points), NearestPoints(coarse.points))
 
 
 def compare_clouds(
@@ -217,12 +196,10 @@ def _compare(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> M
         which = "estimate" if not len(means) else "ground truth"
         return empty | {"reconstruction/reason": f"the {which} has no points"}
     rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
-    if config.max_points is None:
-        some = means.rows(_spread(len(means), config.num_sampled, rng))
-        parts = means.tables() if len(some) < len(means) else ()
-    else:
-        some, parts = means.rows(_choice(len(means), config.max_points, rng)), ()
-    kept = _choice(len(truth.cloud), config.max_points, rng)
+    is_whole = config.max_points is None
+    rows = _spread(len(means), config.num_sampled, rng) if is_whole else _choice(len(means), config.max_points, rng)
+    some, kept = means.rows(rows), _choice(len(truth.cloud), config.max_points, rng)
+    parts = means.tables() if is_whole and len(some) < len(means) else ()
     normals, of_truth = truth.cloud.normals[kept], truth.points
     if len(kept) < len(truth.cloud):
         of_truth = NearestPoints(truth.cloud.points[kept])
@@ -298,21 +275,29 @@ def _abs_cosines(normals: np.ndarray, others: np.ndarray) -> np.ndarray:
 def _fit_planes(
     samples: np.ndarray,
     valid: np.ndarray,
-    previous: tuple[np.ndarray, np.ndarray, np.ndarray],
+    slopes: np.ndarray,
+    offset: np.ndarray,
+    gap: np.ndarray,
     config: EvaluationConfig,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit inverse depth = centre's + offset + slopes · (ray − centre's ray) around every pixel of samples (3, h, w).
 
-    Takes the taps within `previous`' gap of its plane (slopes, offset, gap). Returns slopes (2, h, w), offset (h, w)
-    and whether there were enough taps in both directions.
+    Takes the taps within `gap` (h, w) of the planes with these slopes (2, h, w) and offset (h, w). Returns slopes and
+    offset, and whether there were enough taps in both directions.
     """
     (_, h, w), radius = samples.shape, config.normal_radius_px
     padded, is_valid = np.pad(samples, ((0, 0), (radius, radius), (radius, radius))), np.pad(valid, radius)
-    sums = np.zeros((9, h, w), np.float32)
+    shifts, sums = range(0, 2 * radius + 1, config.normal_step_px), np.zeros((9, h, w), np.float32)
     for top in range(0, h, _BAND_ROWS):
-        rows, around = slice(top, top + _BAND_ROWS), slice(top, top + _BAND_ROWS + 2 * radius)
-        slopes, offset, gap = (values[..., rows, :] for values in previous)
-        _add_taps(sums[:, rows], samples[:, rows], (padded[:, around], is_valid[around]), (slopes, offset, gap), config)
+        band = slice(top, min(top + _BAND_ROWS, h))
+        for row, column in itertools.product(shifts, shifts):
+            window = slice(band.start + row, band.stop + row), slice(column, column + w)
+            x, y, d = padded[:, *window] - samples[:, band]
+            distance = np.abs(d - offset[band] - slopes[0, band] * x - slopes[1, band] * y)
+            keep = is_valid[window] & (distance <= gap[band])
+            x, y, d = x * keep, y * keep, d * keep
+            for total, term in zip(sums[:, band], (keep, x, y, d, x * x, x * y, y * y, x * d, y * d), strict=True):
+                total += term
     count = np.maximum(sums[0], 1.0)
     x, y, d, xx, xy, yy, xd, yd = sums[1:] / count
     xx, xy, yy, xd, yd = xx - x * x, xy - x * y, yy - y * y, xd - x * d, yd - y * d
@@ -321,28 +306,3 @@ def _fit_planes(
     scale = np.where(good, 1.0 / np.where(good, determinant, 1.0), 0.0)
     a, b = (yy * xd - xy * yd) * scale, (xx * yd - xy * xd) * scale
     return np.stack([a, b]), d - a * x - b * y, good
-
-
-def _add_taps(
-    sums: np.ndarray,
-    samples: np.ndarray,
-    around: tuple[np.ndarray, np.ndarray],
-    previous: tuple[np.ndarray, np.ndarray, np.ndarray],
-    config: EvaluationConfig,
-) -> None:
-    """Add 1, x, y, d and their products over the taps of the pixels of a band to sums (9, b, w).
-
-    Args:
-        samples: of the band's pixels, (3, b, w).
-        around: samples and their validity with the window's radius on every side.
-        previous: slopes, offset and gap of the planes that a tap has to be near to.
-    """
-    (_, h, w), (padded, is_valid), (slopes, offset, gap) = samples.shape, around, previous
-    shifts = range(0, 2 * config.normal_radius_px + 1, config.normal_step_px)
-    for row, column in ((row, column) for row in shifts for column in shifts):
-        window = (slice(row, row + h), slice(column, column + w))
-        x, y, d = padded[(slice(None), *window)] - samples
-        keep = is_valid[window] & (np.abs(d - offset - slopes[0] * x - slopes[1] * y) <= gap)
-        x, y, d = x * keep, y * keep, d * keep
-        for total, term in zip(sums, (keep, x, y, d, x * x, x * y, y * y, x * d, y * d), strict=True):
-            total += term

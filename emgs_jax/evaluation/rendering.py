@@ -15,23 +15,14 @@ _TOLERANCE = 0.05  # of the true depth; it is in the name of the metric
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Errors of one rendered view against its frame. Shares are of the pixels whose true depth is known.
+    """Errors of one rendered view against its frame. Shares are of the pixels whose true depth is known."""
 
-    Args:
-        coverage: share with a rendered depth.
-        within: share whose rendered depth is within 5 % of the truth.
-        depth_l1: mean absolute error of the depth, m; None where nothing is covered.
-        squared_error: of the colours, RGB in [0, 1], summed over the covered pixels and channels.
-        num_colors: how many numbers that are; 0 where no colours were rendered.
-        confusion: of the pixels whose true class is known, see `segmentation`; None where no classes are compared.
-    """
-
-    coverage: float
-    within: float
-    depth_l1: float | None = None
-    squared_error: float = 0.0
-    num_colors: int = 0
-    confusion: np.ndarray | None = None
+    coverage: float  # share with a rendered depth
+    within: float  # share whose rendered depth is within 5 % of the truth
+    depth_l1: float | None = None  # mean absolute error of the depth, m; None where nothing is covered
+    squared_error: float = 0.0  # of the colours, RGB in [0, 1], summed over the covered pixels and channels
+    num_colors: int = 0  # how many numbers that are; 0 where no colours were rendered
+    confusion: np.ndarray | None = None  # of the pixels whose true class is known, where classes are compared
 
 
 class Rendered:
@@ -95,22 +86,19 @@ def score_view(
         max_depth: m.
     """
     truth = frame.static_depth
-    if truth is None:
-        return None
-    is_known = (truth > 0) & (truth <= max_depth)
-    if not is_known.any():
+    is_known = None if truth is None else (truth > 0) & (truth <= max_depth)
+    if is_known is None or not is_known.any():
         return None
     if depth is None:
         return ViewScore(0.0, 0.0)
     true, found = truth[is_known].astype(np.float64), scale * depth[is_known].astype(np.float64)
     is_covered = np.isfinite(found) & (found > 0)
-    error = np.abs(found - true)[is_covered]
-    score = {"squared_error": 0.0, "num_colors": 0}
+    error, difference = np.abs(found - true)[is_covered], np.zeros(0)
     if colors is not None:
         difference = colors[is_known][is_covered].astype(np.float64) - frame.image[is_known][is_covered] / 255.0
-        score = {"squared_error": float(np.sum(difference**2)), "num_colors": difference.size}
     within = float(np.sum(error <= _TOLERANCE * true[is_covered]) / len(true))
-    return ViewScore(float(is_covered.mean()), within, float(error.mean()) if len(error) else None, **score)
+    depth_l1, squares = float(error.mean()) if len(error) else None, float(np.sum(difference**2))
+    return ViewScore(float(is_covered.mean()), within, depth_l1, squares, difference.size)
 
 
 def rendering_metrics(views: Iterable[ViewScore | None]) -> dict[str, float | int | None]:

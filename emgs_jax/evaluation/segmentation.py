@@ -13,8 +13,7 @@ import numpy as np
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.class_file import ClassFile
-from emgs_jax.data.spool import Spool
-from emgs_jax.evaluation.clouds import SOME, NearestPoints, by_ranges, cell_centers, cell_edges, cell_numbers
+from emgs_jax.evaluation.clouds import NearestPoints, SpooledRows, cell_centers, cell_numbers
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, Reference, align_points, own_voxel
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.geometry import rotated
@@ -26,54 +25,41 @@ _MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memor
 
 @dataclass(frozen=True)
 class LabelledPoints:
-    """Points with a class each.
+    """Points with a class each."""
 
-    Args:
-        points: (n, 3), metres.
-        labels: (n,), position in `classes`; any other number is no class.
-    """
-
-    points: np.ndarray
-    labels: np.ndarray
+    points: np.ndarray  # (n, 3), metres
+    labels: np.ndarray  # (n,), position in `classes`; any other number is no class
     classes: tuple[str, ...]
 
 
-def label_cells(frame: Frame, dataset: Dataset, voxel: float, max_depth: float) -> np.ndarray:
-    """The voxels [m] of the world that a frame sees and the true class in them, each pair once.
+class TrueLabels:
+    """The true classes in the voxels [m] of the world that labelled frames see, each pair once.
 
-    Returns rows (n, 2) of a class and a cell's number, ordered by cell.
+    It grows with what is seen, not with the frames.
     """
-    if frame.labels is None or frame.depth is None or frame.T_world_camera is None:
-        return np.empty((0, 2), np.int64)
-    known = (frame.labels >= 0) & (frame.static_depth > 0) & (frame.depth <= max_depth)
-    points = backproject(frame.depth, dataset.intrinsics)[known]
-    points = rotated(points, frame.T_world_camera[:3, :3]) + frame.T_world_camera[:3, 3]
-    return _distinct(np.column_stack([frame.labels[known].astype(np.int64), cell_numbers(points, voxel)]))
 
+    def __init__(self, dataset: Dataset, voxel: float, max_depth: float) -> None:
+        self._dataset, self._voxel, self._max_depth = dataset, voxel, max_depth
+        self._rows = [np.empty((0, 2), np.int64)]  # a class and a cell's number, by cell; the first is what was merged
 
-class DistinctCells:
-    """The `label_cells` of many frames, each once: it grows with what is seen, not with the frames."""
-
-    def __init__(self) -> None:
-        self._rows = [np.empty((0, 2), np.int64)]  # the first is what was merged
-
-    def append(self, cells: np.ndarray) -> None:
-        """Add those of a frame."""
-        self._rows.append(cells)
+    def append(self, frame: Frame) -> None:
+        """Add what a frame sees."""
+        if frame.labels is None or frame.depth is None or frame.T_world_camera is None:
+            return
+        known = (frame.labels >= 0) & (frame.static_depth > 0) & (frame.depth <= self._max_depth)
+        points = backproject(frame.depth, self._dataset.intrinsics)[known]
+        points = rotated(points, frame.T_world_camera[:3, :3]) + frame.T_world_camera[:3, 3]
+        cells = cell_numbers(points, self._voxel)
+        self._rows.append(_distinct(np.column_stack([frame.labels[known].astype(np.int64), cells])))
         if sum(map(len, self._rows[1:])) > max(_MERGE_ROWS, len(self._rows[0])):
-            self._rows = [self.rows()]
+            self._rows = [_distinct(np.concatenate(self._rows))]
 
-    def rows(self) -> np.ndarray:
-        """All of them (n, 2), ordered by cell."""
-        return _distinct(np.concatenate(self._rows))
-
-
-def true_labels(cells: DistinctCells, dataset: Dataset, voxel: float) -> LabelledPoints | None:
-    """A point for every class that is seen in a voxel [m]: its centre; None where no frame has `label_cells`."""
-    rows = cells.rows()
-    if not len(rows):
-        return None
-    return LabelledPoints(cell_centers(rows[:, 1], voxel), rows[:, 0], tuple(dataset.classes))
+    def points(self) -> LabelledPoints | None:
+        """A point for every class that is seen in a voxel: its centre; None where nothing is seen."""
+        rows = _distinct(np.concatenate(self._rows))
+        if not len(rows):
+            return None
+        return LabelledPoints(cell_centers(rows[:, 1], self._voxel), rows[:, 0], tuple(self._dataset.classes))
 
 
 def align_labels(
@@ -114,39 +100,32 @@ def nearest_classes(features: np.ndarray, text_features: np.ndarray) -> np.ndarr
 
 
 class SpooledLabels:
-    """The points of many views with their classes, in a temporary file, counted once the side of a voxel is known.
-
-    See `clouds.SpooledCloud`. float32 (n, 4) a view: x, y, z and the class.
-    """
+    """The points of many views with their classes, as `SpooledRows` (n, 4) of float32: x, y, z and the class."""
 
     def __init__(self, classes: Sequence[str]) -> None:
-        self._parts, self._some, self._count, self._classes = Spool(), [np.empty((0, 3))], 0, tuple(classes)
+        self._rows, self._classes = SpooledRows(), tuple(classes)
 
     def append(self, points: np.ndarray, labels: np.ndarray) -> None:
         """Add a view: points (n, 3) and their classes (n,); what has none or is not finite is left out."""
-        known = (labels >= 0) & np.isfinite(points).all(-1)
-        rows = np.column_stack([points[known], labels[known]]).astype(np.float32)
-        self._parts.append(rows)
-        self._some.append(rows[::SOME, :3].astype(np.float64))
-        self._count += len(rows)
+        known = labels >= 0
+        self._rows.append(np.column_stack([points[known], labels[known]]))
 
     def points(self, voxel: float) -> LabelledPoints:
         """The centre of every voxel [lengths of the points] with the class of most views.
 
         A view counts once in a voxel; of equally frequent classes it is the first.
         """
-        edges = cell_edges(np.concatenate(self._some), self._count, voxel)
-        views = (self._parts[row] for row in range(len(self._parts)))
-        seen = (
-            _distinct(np.column_stack([view[:, 3].astype(np.int64), cell_numbers(view[:, :3], voxel)]))
-            for view in views
-        )
-        found = [_most_seen(rows) for rows in by_ranges(((pairs[:, 1], pairs) for pairs in seen), edges)]
+
+        def read(view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            pairs = _distinct(np.column_stack([view[:, 3].astype(np.int64), cell_numbers(view[:, :3], voxel)]))
+            return pairs[:, 1], pairs
+
+        found = [most_seen(rows) for rows in self._rows.by_ranges(voxel, read)]
         whole = np.concatenate([np.empty((0, 2), np.int64), *found])
         return LabelledPoints(cell_centers(whole[:, 1], voxel), whole[:, 0].astype(np.int32), self._classes)
 
 
-def _most_seen(rows: np.ndarray) -> np.ndarray:
+def most_seen(rows: np.ndarray) -> np.ndarray:
     """The most frequent label of each cell, of equally frequent ones the first; rows (n, 2) of a label and a cell."""
     rows = rows[np.lexsort(rows.T)]
     begins = np.flatnonzero((np.diff(rows, axis=0, prepend=-1) != 0).any(1))
@@ -214,11 +193,7 @@ def _distinct(rows: np.ndarray) -> np.ndarray:
 
 
 def read_labelled_mesh(folder: Path, scene: str, classes: ClassFile) -> LabelledPoints:
-    """The vertices of a scene with their classes, -1 = none.
-
-    Raises:
-        ValueError: a file is missing or damaged, the ids are not as many as the vertices, or one has no name.
-    """
+    """The vertices of a scene with their classes, -1 = none; ValueError where its files are missing or do not fit."""
     mesh, labels = folder / f"{scene}_mesh.ply", folder / f"{scene}.txt"
     missing = [path.name for path in (mesh, labels) if not path.is_file()]
     if missing:
@@ -228,17 +203,12 @@ def read_labelled_mesh(folder: Path, scene: str, classes: ClassFile) -> Labelled
         )
     vertices = read_vertices(mesh)
     points = np.stack([vertices[axis].astype(np.float64) for axis in "xyz"], axis=1)
-    ids = _ids(labels)
+    try:
+        ids = np.array(labels.read_bytes().split(), np.object_).astype(np.int64)
+    except (ValueError, OverflowError) as error:
+        raise ValueError(f"{labels} is no list of whole numbers, one a vertex ({error}): fetch it again") from error
     if len(ids) != len(points):
         raise ValueError(
             f"{labels} has {len(ids)} labels and {mesh} {len(points)} vertices: fetch both files of the same mesh"
         )
     return LabelledPoints(points, classes.positions_of(ids, labels), classes.names)
-
-
-def _ids(path: Path) -> np.ndarray:
-    words = path.read_bytes().split()
-    try:
-        return np.array(words, dtype=f"S{max(map(len, words), default=1)}").astype(np.int64)
-    except (ValueError, OverflowError) as error:
-        raise ValueError(f"{path} is no list of whole numbers, one a vertex ({error}): fetch it again") from error

@@ -7,7 +7,7 @@ import numpy as np
 
 from emgs_jax.data.pose_conventions import EXPECTED, READINGS
 from emgs_jax.data.timestamps import resolution
-from emgs_jax.geometry import Sim3
+from emgs_jax.geometry import Sim3, pose_difference
 
 MIN_ODD_DEG, MIN_GAIN = 1.0, 3.0  # rotation per motion, and by which factor another convention must fit better
 _MAX_ROLL_STD = 0.25  # rad, of the roll about a path by its positions, above which orientations know it better
@@ -41,11 +41,10 @@ def align(estimate: np.ndarray, reference: np.ndarray, with_scale: bool) -> Sim3
     is not); `align_poses` takes it from the orientations. Raises DegenerateTrajectoryError.
     """
     estimate, reference = _checked(estimate, reference, 3)
-    if with_scale:
-        _require_motion(estimate, "estimate")
-        _require_motion(reference, "reference")
-    centered, target = estimate - estimate.mean(0), reference - reference.mean(0)
-    return _solve(estimate, reference, target.T @ centered / len(estimate), with_scale)
+    for name, points in (("estimate", estimate), ("reference", reference)):
+        if with_scale and _spread(points) < _MIN_SPREAD_M:
+            raise DegenerateTrajectoryError(f"the {name} does not move: no scale can be estimated")
+    return _solve(estimate, reference, _covariance(estimate, reference), with_scale)
 
 
 def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tuple[Sim3, str | None]:
@@ -57,9 +56,9 @@ def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tu
     """
     x, y = _checked(np.asarray(estimate)[:, :3, 3], np.asarray(truth)[:, :3, 3], 1)
     orientations = np.einsum("nij,nkj->ik", np.asarray(truth)[:, :3, :3], np.asarray(estimate)[:, :3, :3]) / len(x)
-    covariance = (y - y.mean(0)).T @ (x - x.mean(0)) / len(x)
     if len(x) < 3 or min(_spread(x), _spread(y)) < _MIN_SPREAD_M:
         return _solve(x, y, orientations, False), f"{len(x)} poses without enough motion: aligned by orientation"
+    covariance = _covariance(x, y)
     u, singular, vt = np.linalg.svd(covariance)
     found = _solve(x, y, covariance, with_scale)
     # n positions of error σ hold the roll about their line to σ / (w √n), w being how wide they lie beside it.
@@ -82,10 +81,8 @@ def rpe(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
 
     The estimate's own scale is kept: this is what an odometry user gets.
     """
-    moved_estimate = np.linalg.inv(estimate[:-1]) @ estimate[1:]
-    moved_truth = np.linalg.inv(truth[:-1]) @ truth[1:]
-    error = np.linalg.inv(moved_truth) @ moved_estimate
-    return _rms(np.linalg.norm(error[:, :3, 3], axis=-1)), _rms(np.degrees(rotation_angles(error[:, :3, :3])))
+    distances, angles = pose_difference(*(np.linalg.inv(path[:-1]) @ path[1:] for path in (truth, estimate)))
+    return _rms(distances), _rms(angles)
 
 
 def trajectory_metrics(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float | int | str | None]:
@@ -134,9 +131,7 @@ def _solve(
         u, _, vt = np.linalg.svd(covariance)
         signs = np.array([1.0, 1.0, 1.0 if np.linalg.det(u @ vt) > 0 else -1.0])  # never a reflection
         rotation = (u * signs) @ vt
-    scale = 1.0
-    if with_scale:
-        scale = float(np.trace(rotation.T @ covariance)) / _spread(x) ** 2
+    scale = float(np.trace(rotation.T @ covariance)) / _spread(x) ** 2 if with_scale else 1.0
     return Sim3(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
 
 
@@ -151,9 +146,8 @@ def _checked(estimate: np.ndarray, reference: np.ndarray, minimum: int) -> tuple
     return estimate, reference
 
 
-def _require_motion(points: np.ndarray, name: str) -> None:
-    if _spread(points) < _MIN_SPREAD_M:
-        raise DegenerateTrajectoryError(f"the {name} does not move: no scale can be estimated")
+def _covariance(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    return (y - y.mean(0)).T @ (x - x.mean(0)) / len(x)
 
 
 def _nearest(queries: np.ndarray, values: np.ndarray) -> np.ndarray:
@@ -171,10 +165,3 @@ def _spread(points: np.ndarray) -> float:
 
 def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.square(values))))
-
-
-def rotation_angles(rotations: np.ndarray) -> np.ndarray:
-    """Rotation angles [rad] of (n, 3, 3); atan2 keeps the digits of small angles that arccos loses."""
-    skew = rotations - np.swapaxes(rotations, -1, -2)
-    sine = 0.5 * np.linalg.norm(np.stack([skew[:, 2, 1], skew[:, 0, 2], skew[:, 1, 0]], -1), axis=-1)
-    return np.arctan2(sine, 0.5 * (np.trace(rotations, axis1=-2, axis2=-1) - 1.0))

@@ -3,11 +3,12 @@
 import os
 from typing import NamedTuple
 
+import cv2
 import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.text import Text
 
-from emgs_jax.io.files import atomic_write
+from emgs_jax.io.files import atomic_write, write_file
 
 STATUS_COLORS = {
     "tracked": "#2f9e6e",
@@ -55,6 +56,11 @@ def class_colors(count: int) -> np.ndarray:
 def to_bytes(values: np.ndarray) -> np.ndarray:
     """Convert values in [0, 1] to uint8; what is outside is clipped, nan becomes 0."""
     return np.rint(255 * np.nan_to_num(values).clip(0.0, 1.0)).astype(np.uint8)
+
+
+def save_png(path: str | os.PathLike, image: np.ndarray) -> None:
+    """Write RGB (h, w, 3) of 8 bits, or numbers (h, w) of 8 or 16 bits, as PNG, whole or not at all."""
+    write_file(path, cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)[1].tobytes())
 
 
 def save_figure(path: str | os.PathLike, figure: Figure) -> None:

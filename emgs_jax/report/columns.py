@@ -1,14 +1,15 @@
-"""Tables: the main metrics as columns with their units, numbers as text, and writers for Markdown, terminals and CSV.
+"""Tables of results: the main metrics as columns in their unit, and writers for Markdown, terminals and CSV.
 
 Pages write the same tables by `table` of web/parts.html.
 """
 
 import csv
 import io
-from collections.abc import Hashable, Iterable, Mapping, Sequence
+from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 DASH = "–"
+OWN_UNITS = ("colmap", "nerfstudio")  # data sets whose true poses are in a unit of their own
 
 
 class Column(NamedTuple):
@@ -57,27 +58,33 @@ class Table(NamedTuple):
 
 
 class Line(NamedTuple):
-    """Metrics of one estimate.
+    """Metrics of one estimate."""
 
-    Args:
-        labels: its first cells.
-        values: by key; None where there is none.
-        rivals: the same of all lines that it competes with; None: with none.
-    """
-
-    labels: Sequence[str]
-    values: Mapping[str, float | None]
+    labels: Sequence[str]  # its first cells
+    values: Mapping[str, float | None]  # by key; None where there is none
     spreads: Mapping[str, float | None] = {}
-    rivals: Hashable = ()
+    rivals: Hashable = ()  # the same of all lines that it competes with; None: with none
 
 
-def known(columns: Iterable[Column], lines: Sequence[Line]) -> list[Column]:
-    """Keep the columns in which some line has a value."""
-    return [column for column in columns if any(line.values.get(column.key) is not None for line in lines)]
+def known(columns: Iterable[Column], rows: Sequence[Mapping[str, Any]]) -> list[Column]:
+    """Keep the columns in which some row has a value."""
+    return [column for column in columns if any(row.get(column.key) is not None for row in rows)]
 
 
-def metric_table(titles: Sequence[str], columns: Sequence[Column], lines: Sequence[Line]) -> Table:
-    """Lay out metrics below the titles of the labels and of the columns; the best of several rivals is marked."""
+def in_unit(columns: Iterable[Column], data: Collection[str]) -> list[Column]:
+    """Titles of lengths as they are for data sets of these names: in centimetres, or in the truth's own unit."""
+    own = [name in OWN_UNITS for name in data]
+    unit = "cm" if not any(own) else ".01 units" if all(own) else "cm or .01 units"
+    return [column._replace(title=column.title.replace("[cm]", f"[{unit}]")) for column in columns]
+
+
+def metric_table(
+    titles: Sequence[str], columns: Sequence[Column], lines: Sequence[Line], data: Collection[str]
+) -> Table:
+    """Lay out metrics below the titles of the labels and of the columns; the best of several rivals is marked.
+
+    `data` are the names of the data sets that they are of, which say the unit of lengths.
+    """
     numbers: dict[tuple, list[float]] = {}
     for line in lines:
         for column in columns:
@@ -94,7 +101,7 @@ def metric_table(titles: Sequence[str], columns: Sequence[Column], lines: Sequen
         return Cell(text, "best" if value is not None and value == best.get((line.rivals, column)) else "")
 
     laid_out = [[*line.labels, *(number(line, column) for column in columns)] for line in lines]
-    return Table([*titles, *(column.title for column in columns)], laid_out)
+    return Table([*titles, *(column.title for column in in_unit(columns, data))], laid_out)
 
 
 def transposed(table: Table) -> Table:

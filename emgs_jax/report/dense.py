@@ -13,7 +13,7 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.device.arrays import fetched, to_se3
 from emgs_jax.device.executables import stored
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
-from emgs_jax.evaluation.reconstruction import EvaluationConfig, own_voxel, posed_cloud
+from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, own_voxel, posed
 from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import LabelledPoints, translate
 from emgs_jax.evaluation.trajectory import align_poses
@@ -30,18 +30,12 @@ _densify = stored(densify)
 
 @dataclass(frozen=True)
 class DenseMap:
-    """The map as points.
+    """The map as points: a point per pixel of every frame whose pose is known, averaged per voxel."""
 
-    Args:
-        cloud: a point per pixel of every frame whose pose is known, averaged per voxel, in the colours of the images.
-        labels: class of each of its points; None without classes.
-        rendering: `rendering_metrics` of the views that the cloud is made from; empty without truth.
-    """
-
-    cloud: PointCloud
-    labels: LabelledPoints | None = None
-    pictures: list[dict[str, Any]] = field(default_factory=list)
-    rendering: dict[str, float | int | None] = field(default_factory=dict)
+    cloud: PointCloud  # in the colours of the images
+    labels: LabelledPoints | None = None  # class of each of its points; None without classes
+    pictures: list[dict[str, Any]] = field(default_factory=list)  # of some views, as `draw_overview` takes them
+    rendering: dict[str, float | int | None] = field(default_factory=dict)  # of all views; empty without truth
 
 
 def dense_map(
@@ -72,12 +66,18 @@ def dense_map(
 
     def clouds() -> Iterator[PointCloud]:
         for row, view in zip(known, _drawn(run, known, config), strict=True):
-            is_shown = row in shown
-            labels = _label_image(view, labelled) if is_shown or compares_classes else None
-            if is_shown:
-                pictures.append(_picture(run, dataset, row, view) | ({} if labels is None else {"labels": labels}))
-            found = translate(labels, labelled.classes, dataset.classes) if compares_classes else None
-            rendered.add(row, np.where(view.valid, view.depth, 0.0), view.colors, found)
+            labels = found = None
+            if labelled is not None and (row in shown or compares_classes):
+                # At the rim of what was seen the coverage is too little for a depth, and enough for a class.
+                labels = np.full(view.covered.shape, -1)
+                labels[view.covered] = labelled.classes_of(view.points[view.covered].astype(np.float64))
+                found = translate(labels, labelled.classes, dataset.classes) if compares_classes else None
+            depth = np.where(view.valid, view.depth, 0.0)
+            if row in shown:
+                image, title = with_moving(dataset[row].image, vars(run.records[row])), run.records[row].index
+                picture = {"image": image, "title": f"frame {title}", "valid": view.valid, "labels": labels}
+                pictures.append(picture | {"rendered_color": view.colors, "rendered_depth": depth})
+            rendered.add(row, depth, view.colors, found)
             # A voxel's colour is the mean of all pixels that see it: those of near and frontal views are most of them.
             image = dataset[row].image
             if config.points == "map":
@@ -86,7 +86,7 @@ def dense_map(
             else:
                 points = run.records[row].scale * own[row]
                 kept, normals = uncontradicted(points, view, run.camera, float(config.surface_depth))
-                seen = posed_cloud(points, kept, image, run.poses[row], evaluation)
+                seen = posed(camera_cloud(points, kept, image, evaluation), run.poses[row])
                 normals = np.where(normals[kept].any(-1, keepdims=True), normals[kept], seen.normals)
                 yield PointCloud(seen.points, normals, seen.colors)
 
@@ -145,25 +145,3 @@ def center_cloud(run: MappingRun) -> PointCloud:
     gaussians = jax.device_get(confirmed(run.state.map))
     rows = (gaussians.means, gaussians.normals, gaussians.colors)
     return PointCloud(*(values[gaussians.valid].astype(np.float64) for values in rows))
-
-
-def _picture(run: MappingRun, dataset: Dataset, row: int, view: Any) -> dict[str, Any]:
-    return {
-        "image": with_moving(dataset[row].image, vars(run.records[row])),
-        "rendered_color": view.colors,
-        "rendered_depth": np.where(view.valid, view.depth, 0.0),
-        "valid": view.valid,
-        "title": f"frame {run.records[row].index}",
-    }
-
-
-def _label_image(view: Any, labelled: LabelledMap | None) -> np.ndarray | None:
-    """Class of each pixel (h, w) that anything covers, -1 = none; None without classes.
-
-    At the rim of what was seen the coverage is too little for a depth, and enough for a class.
-    """
-    if labelled is None:
-        return None
-    labels = np.full(view.covered.shape, -1)
-    labels[view.covered] = labelled.classes_of(view.points[view.covered].astype(np.float64))
-    return labels

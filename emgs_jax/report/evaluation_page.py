@@ -9,7 +9,7 @@ from markupsafe import Markup
 from emgs_jax.report.columns import MAIN, Cell, Line, Table, known, metric_table
 from emgs_jax.report.finished_run import REPORT_FILE
 from emgs_jax.report.html import MAX_LINES, Head, link, page, picture, thumbnails, write_page
-from emgs_jax.report.provenance import RAW_PRIOR, in_unit, length_words
+from emgs_jax.report.provenance import RAW_PRIOR, length_words
 from emgs_jax.report.results import METRICS_FILE, Estimate, read_metrics
 from emgs_jax.report.tables import COLUMNS, Row, over
 
@@ -23,18 +23,13 @@ class JobLine(NamedTuple):
 
 
 class Found(NamedTuple):
-    """Outcome of an evaluation.
-
-    Args:
-        gate: the file that was compared with; None without one.
-        regressions: metrics that are worse than the gate allows, a line each.
-    """
+    """Outcome of an evaluation."""
 
     jobs: Sequence[JobLine]
     rows: Sequence[Row]
     estimates: Sequence[Estimate]
-    gate: str | None = None
-    regressions: Sequence[str] = ()
+    gate: str | None = None  # the file that was compared with
+    regressions: Sequence[str] = ()  # metrics that are worse than the gate allows, a line each
 
 
 def write_evaluation_page(out: Path, found: Found, command: str) -> Path:
@@ -104,6 +99,6 @@ def _errors(rows: Sequence[Row]) -> Table:
         rivals = row.dataset, row.sequences, row.protocol, row.is_simulated
         lines.append(Line(labels, row.values, row.spreads, rivals))
     titles = ("data set", "sequence", "setting", "", "source", "protocol", "seeds")
-    columns = in_unit(known(COLUMNS, lines), {row.dataset for row in rows})
-    table = metric_table(titles, columns, lines)
+    columns = known(COLUMNS, [row.values for row in rows])
+    table = metric_table(titles, columns, lines, {row.dataset for row in rows})
     return table._replace(lines=table.lines[:MAX_LINES])

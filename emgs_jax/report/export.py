@@ -5,7 +5,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from emgs_jax.data.readable import ReadableFrames
@@ -19,7 +18,7 @@ from emgs_jax.io.ply_reader import read_vertices, scale_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.ranges import number
-from emgs_jax.report.colors import OURS, STATUS_COLORS, rgb
+from emgs_jax.report.colors import OURS, STATUS_COLORS, rgb, save_png
 from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.report.moving import moving_mask
 
@@ -32,32 +31,23 @@ SHORTEST = 1e-6  # of the run's unit; a shorter distance between two cameras say
 
 @dataclass(frozen=True)
 class ExportConfig:
-    """Settings of an export of a run: formats, size and scale.
-
-    Args:
-        scale: factor on all lengths; None = 1.
-        length: instead of it two frames and the metres between their cameras, see `factor_of`.
-        images: as `used` in the run, or in the `original` size on disk; either way without distortion.
-        moving: `kept` in the images, or `masked`: a mask beside each, black where something moves.
-    """
+    """Settings of an export of a run: formats, size and scale."""
 
     formats: Sequence[str]
     max_points: int = number(low=1, high=2**26)
-    scale: float | None = number(low=1e-6, high=1e6)
-    length: Sequence[float] | None = number(low=0, high=2**31)
+    scale: float | None = number(low=1e-6, high=1e6)  # factor on all lengths; None = 1
+    length: Sequence[float] | None = number(low=0, high=2**31)  # instead of it, see `factor_of`
+    # As in the run, or in the size on disk; either way without distortion.
     images: str = field(default="used", metadata={"choices": ("used", "original")})
+    # What moves stays in the images, or there is a mask beside each, black where something moves.
     moving: str = field(default="kept", metadata={"choices": ("kept", "masked")})
 
 
 def export(run: FinishedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
     """Write a run into `folder`, which is there, in the run's unit; returns what was written.
 
-    Args:
-        dataset: the images of the run; None where they are gone.
-
-    Raises:
-        ValueError: an unknown format, one that needs images or points which are not there, or something stands where
-            an export would; then nothing is written.
+    ValueError for an unknown format, one that needs images or points which are not there, or where something stands in
+    the place of an export; then nothing is written.
     """
     if unknown := [name for name in config.formats if name not in FORMATS]:
         raise ValueError(f"formats={unknown[0]} is not known: choose of {', '.join(FORMATS)}")
@@ -72,8 +62,8 @@ def export(run: FinishedRun, folder: Path, config: ExportConfig, dataset: Readab
         if name == "frustums":
             _frustums(run, folder / FORMATS[name])
         else:
-            write = _colmap if name == "colmap" else _nerfstudio
-            write(run, folder / FORMATS[name], dataset, config)
+            with new_folder(folder / FORMATS[name]) as new:
+                _project(run, new, dataset, config, is_colmap=name == "colmap")
     return [folder / FORMATS[name] for name in config.formats]
 
 
@@ -86,29 +76,32 @@ def find_factor(run: FinishedRun, config: ExportConfig) -> float | None:
     return factor_of(run, config.length)
 
 
-def _colmap(run: FinishedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig) -> None:
-    """Write a project folder: images/, sparse/0/, and masks/ by COLMAP's names."""
-    with new_folder(folder) as new:
-        names = _write_images(new / "images", run, dataset)
-        if config.moving == "masked":
-            _write_masks(new / "masks", run, [f"{name}.png" for name in names])
-        model = new / "sparse" / "0"
+def _project(run: FinishedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig, is_colmap: bool) -> None:
+    """Write images/ and masks/ of the placed frames, and sparse/0/ of COLMAP or nerfstudio's transforms.json.
+
+    An image is undistorted and in the run's size. Its name is the frame's number and has one dot: 3DGS cuts at the
+    first one. A mask is black where something moves; for COLMAP its name is that of the image and .png.
+    """
+    rows, size = np.flatnonzero(run.is_placed), (run.camera.width, run.camera.height)
+    names, masks = [f"{run.frames[row]['index']:06d}.png" for row in rows], []
+    (folder / "images").mkdir()
+    for row, name in zip(rows, names, strict=True):
+        save_png(folder / "images" / name, dataset[row].image)
+    if config.moving == "masked":
+        masks = [f"masks/{name}{'.png' * is_colmap}" for name in names]
+        (folder / "masks").mkdir()
+        for row, mask in zip(rows, masks, strict=True):
+            save_png(folder / mask, np.uint8(255) * ~moving_mask(run.frames[row], size))
+    poses, (points, colors) = run.poses[rows], _cloud(run, config.max_points)
+    if is_colmap:
+        model = folder / "sparse" / "0"
         model.mkdir(parents=True)
-        save_colmap(model, run.camera, names, run.poses[run.is_placed], *_cloud(run, config.max_points))
-
-
-def _nerfstudio(run: FinishedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig) -> None:
-    """Write images/, masks/, points.ply and transforms.json."""
-    with new_folder(folder) as new:
-        names, masks = _write_images(new / "images", run, dataset), []
-        if config.moving == "masked":
-            masks = [f"masks/{name}" for name in names]
-            _write_masks(new / "masks", run, names)
-        points, colors = _cloud(run, config.max_points)
+        save_colmap(model, run.camera, names, poses, points, colors)
+    else:
         vertices = np.rec.fromarrays(points.T.astype(np.float32), names="x,y,z")
-        write_ply(new / POINTS_FILE, with_colors(vertices, colors / 255.0))
+        write_ply(folder / POINTS_FILE, with_colors(vertices, colors / 255.0))
         files = [f"images/{name}" for name in names]
-        save_transforms(new / "transforms.json", run.camera, files, run.poses[run.is_placed], POINTS_FILE, masks)
+        save_transforms(folder / "transforms.json", run.camera, files, poses, POINTS_FILE, masks)
 
 
 def _frustums(run: FinishedRun, path: Path) -> None:
@@ -118,49 +111,19 @@ def _frustums(run: FinishedRun, path: Path) -> None:
     save_frustums(path, run.camera, run.poses, colors, is_joined, rgb(OURS))
 
 
-def _write_images(folder: Path, run: FinishedRun, dataset: ReadableFrames) -> list[str]:
-    """Write the images of the placed frames, undistorted and in the run's size; returns their names.
-
-    A name is the frame's number and has one dot: 3DGS cuts at the first one.
-    """
-    folder.mkdir()
-    names = []
-    for row in np.flatnonzero(run.is_placed):
-        names.append(f"{run.frames[row]['index']:06d}.png")
-        if not cv2.imwrite(str(folder / names[-1]), cv2.cvtColor(dataset[row].image, cv2.COLOR_RGB2BGR)):
-            raise OSError(f"{folder / names[-1]} cannot be written: is the disk full?")
-    return names
-
-
-def _write_masks(folder: Path, run: FinishedRun, names: Sequence[str]) -> None:
-    """Write masks of these names for the placed frames, black where something moves."""
-    folder.mkdir()
-    size = run.camera.width, run.camera.height
-    for row, name in zip(np.flatnonzero(run.is_placed), names, strict=True):
-        kept = np.uint8(255) * ~moving_mask(run.frames[row], size)
-        if not cv2.imwrite(str(folder / name), kept):
-            raise OSError(f"{folder / name} cannot be written: is the disk full?")
-
-
 def _cloud(run: FinishedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
     """Draw at most so many points (p, 3) with colours (p, 3), uint8, of the dense cloud; the same ones every time."""
     columns = read_vertices(run.folder / POINTS_FILE)
-    count = len(columns["x"])
-    rows = np.sort(np.random.default_rng(0).permutation(count)[:max_points])
-    points, colors = (
-        np.stack([columns[name][rows] for name in names], 1) for names in (("x", "y", "z"), ("red", "green", "blue"))
-    )
-    return points.astype(np.float64), colors
+    rows = np.sort(np.random.default_rng(0).permutation(len(columns["x"]))[:max_points])
+    points = np.stack([columns[name][rows] for name in "xyz"], 1).astype(np.float64)
+    return points, np.stack([columns[name][rows] for name in ("red", "green", "blue")], 1)
 
 
 def factor_of(run: FinishedRun, length: Sequence[float]) -> float:
     """Find the factor that makes the distance between two cameras as long as it is known to be.
 
-    Args:
-        length: two frames, as `index` of frames.jsonl numbers them, and metres between their camera centres.
-
-    Raises:
-        ValueError: not two frames with a pose that means something and a length above 0, or they are at one place.
+    `length` are two frames, as `index` of frames.jsonl numbers them, and the metres between their camera centres; else,
+    or where a pose means nothing or both are at one place, ValueError.
     """
     if len(length) != 3 or not math.isfinite(length[2]) or length[2] <= 0 or any(n != int(n) for n in length[:2]):
         raise ValueError(f"length must be [frame,frame,metres], two numbers of frames and a length, got {[*length]}")

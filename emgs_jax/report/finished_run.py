@@ -1,8 +1,6 @@
 """A finished run as its folder tells it, for whoever shows it: checked once, read only."""
 
 import json
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import reduce
 from operator import getitem
@@ -21,7 +19,7 @@ from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report.provenance import is_metric
-from emgs_jax.report.results import METRICS_FILE, read_metrics
+from emgs_jax.report.results import METRICS_FILE, read_metrics, sound
 
 TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `experiments.embed`
 LOOPS_FILE = "loops.json"
@@ -30,24 +28,11 @@ FRAMES_FILE = "frames.jsonl"
 SPLATS_FILE = "splats.ply"
 POLISH = (SPLATS_FILE, "polish.json", "polish.png", "polish.npz", "polish.txt")  # of `experiments.polish`
 EXPORTS = ("colmap", "nerfstudio", "cameras.ply", "scaled")  # what `experiments.export` writes beside them
-_POSES = ("raw_pose", "true_pose")
-_PROVENANCE = {  # what of `provenance.provenance` is read again, by dotted key
-    "protocol": (str, type(None)),
-    "simulated": bool,
-    "prior": dict,
-    "prior.name": str,
-    "prior.settings": dict,
-    "data": dict,
-    "data.name": str,
-    "data.sequence": str,
-    "git": (dict, type(None)),
-    "versions": dict,
-    "versions.emgs_jax": str,
-    "device": dict,
-    "device.kind": str,
-    "config": dict,
-    "config.densify": dict,
-    "config.densify.render": dict,
+_PROVENANCE = {"protocol": (str, type(None)), "simulated": bool, "git": (dict, type(None))} | {
+    # What of `provenance.provenance` is read again, by dotted key.
+    **dict.fromkeys(("prior", "data", "versions", "device", "config"), dict),
+    **dict.fromkeys(("prior.settings", "config.densify", "config.densify.render"), dict),
+    **dict.fromkeys(("prior.name", "data.name", "data.sequence", "versions.emgs_jax", "device.kind"), str),
 }
 _WORDS = ("_note", "/reason")  # how metrics end that are no numbers
 _OUTCOMES = ("accepted", "known", "unconfirmed", "unsolved", "refused")
@@ -55,30 +40,20 @@ _OUTCOMES = ("accepted", "known", "unconfirmed", "unsolved", "refused")
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """Outputs of a finished run, as read from its folder.
-
-    Args:
-        frames: lines of frames.jsonl that have a pose, in order.
-        skipped: the other lines.
-        poses: T_world_camera of `frames`, (n, 4, 4) float64: the final ones.
-        online: the same as first estimated, before the back end moved them; nan before it begins, None without one.
-        truth: (n, 4, 4), nan where unknown.
-        text: classes that the map's features are compared with; None without.
-        loops: lines of loops.json; empty without a back end.
-    """
+    """Outputs of a finished run, as read from its folder; poses are T_world_camera of `frames`, (n, 4, 4) float64."""
 
     folder: Path
     metrics: dict[str, Any]
-    frames: list[dict[str, Any]]
-    skipped: list[dict[str, Any]]
-    poses: np.ndarray
-    online: np.ndarray | None
-    raw: np.ndarray
-    truth: np.ndarray
+    frames: list[dict[str, Any]]  # lines of frames.jsonl that have a pose, in order
+    skipped: list[dict[str, Any]]  # the other lines
+    poses: np.ndarray  # the final ones
+    online: np.ndarray | None  # as first estimated; nan before the back end begins, None without one
+    raw: np.ndarray  # of the prior, nan where unknown
+    truth: np.ndarray  # nan where unknown
     map: GaussianMap
     camera: Camera
-    text: TextEmbeddings | None
-    loops: list[dict[str, Any]]
+    text: TextEmbeddings | None  # classes that the map's features are compared with
+    loops: list[dict[str, Any]]  # lines of loops.json; empty without a back end
 
     @property
     def provenance(self) -> dict[str, Any]:
@@ -102,17 +77,11 @@ class FinishedRun:
 
 
 def read_run(folder: Path) -> FinishedRun:
-    """Read the folder of a finished run.
-
-    Raises:
-        ValueError: it is no folder of a finished run of this version; the message names the file and the remedy.
-    """
+    """Read the folder of a finished run of this version; any other raises ValueError with the file and the remedy."""
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder: give the one that a run wrote, with metrics.json in it")
-    missing = [
-        name for name in (METRICS_FILE, FRAMES_FILE, "trajectory.txt", "map.npz") if not (folder / name).is_file()
-    ]
-    if missing:
+    needed = METRICS_FILE, FRAMES_FILE, "trajectory.txt", "map.npz"
+    if missing := [name for name in needed if not (folder / name).is_file()]:
         raise ValueError(f"{folder} holds no finished run: it lacks {', '.join(missing)}; run it to its end")
     metrics = read_metrics(folder / METRICS_FILE, "run again")
     _check_metrics(folder / METRICS_FILE, metrics)
@@ -120,11 +89,9 @@ def read_run(folder: Path) -> FinishedRun:
     frames = [line for line in lines if line.get("pose") is not None]
     _, poses = load_trajectory_tum(folder / "trajectory.txt")
     if len(frames) != len(poses):
-        raise ValueError(
-            f"{folder}: frames.jsonl has {len(frames)} poses and trajectory.txt {len(poses)}: they are of two runs, "
-            "or one was cut off; run again"
-        )
-    raw, truth = (_poses(folder / FRAMES_FILE, frames, name) for name in _POSES)
+        counts = f"frames.jsonl has {len(frames)} poses and trajectory.txt {len(poses)}"
+        raise ValueError(f"{folder}: {counts}: they are of two runs, or one was cut off; run again")
+    raw, truth = (_poses(folder / FRAMES_FILE, frames, name) for name in ("raw_pose", "true_pose"))
     return FinishedRun(
         folder=folder,
         metrics=metrics,
@@ -139,15 +106,6 @@ def read_run(folder: Path) -> FinishedRun:
         text=read_text(folder / TEXT_FILE) if (folder / TEXT_FILE).is_file() else None,
         loops=_loops(folder / LOOPS_FILE, len(poses)),
     )
-
-
-@contextmanager
-def sound(what: str, remedy: str = "run again") -> Iterator[None]:
-    """Raise one ValueError for whatever is wrong with the content of a file that is read inside of the `with`."""
-    try:
-        yield
-    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
-        raise ValueError(f"{what} ({error!r}): {remedy}") from error
 
 
 def _check_metrics(path: Path, metrics: dict[str, Any]) -> None:
@@ -207,17 +165,17 @@ def _loops(path: Path, count: int) -> list[dict[str, Any]]:
         return []
     with sound(f"{path} is no list of loops"):
         loops = json.loads(path.read_text(encoding="utf-8"))
-        is_known = [
-            loop["outcome"] in _OUTCOMES and 0 <= loop["other"] < count and 0 <= loop["frame"] < count for loop in loops
-        ]
-    if not all(is_known):
+        ends = [loop[name] for loop in loops for name in ("frame", "other")]
+        is_known = all(0 <= end < count for end in ends) and {loop["outcome"] for loop in loops} <= {*_OUTCOMES}
+    if not is_known:
         raise ValueError(f"{path} names frames or outcomes that this run does not have: run again")
     return loops
 
 
 def render_config(run: FinishedRun) -> RenderConfig:
     """Read how the run drew its map; raises ValueError for settings of another version."""
-    settings = {key: value for key, value in run.provenance["config"]["densify"]["render"].items() if key != "_target_"}
+    settings = dict(run.provenance["config"]["densify"]["render"])
+    settings.pop("_target_", None)
     with sound(f"{run.folder}/{METRICS_FILE} has settings of another version"):
         for name, field in declared(RenderConfig).items():
             check_value(f"densify.render.{name}", settings.get(name), field)

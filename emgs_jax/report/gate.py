@@ -10,7 +10,7 @@ from typing import Any
 import yaml
 
 from emgs_jax.io.files import atomic_write
-from emgs_jax.report.results import Estimate
+from emgs_jax.report.results import Estimate, sound
 from emgs_jax.report.tables import Row
 
 GATE_FORMAT = 1
@@ -33,8 +33,13 @@ def rounding_tolerances(
         estimates: of some seeds, better more than those of the baseline.
         rounded: of the same jobs, computed by other instructions of the processor.
     """
-    again = {_job(item): item.values for item in rounded if item.kind == "ours"}
-    pairs = [(item.values, again[_job(item)]) for item in estimates if item.kind == "ours" and _job(item) in again]
+
+    def by_job(some: Iterable[Estimate]) -> dict[tuple, dict[str, float]]:
+        ours = (item for item in some if item.kind == "ours")
+        return {(one.dataset, one.sequence, one.variant, one.protocol, one.seed): one.values for one in ours}
+
+    first, again = by_job(estimates), by_job(rounded)
+    pairs = [(first[job], again[job]) for job in first if job in again]
     if len(pairs) < _FEWEST_PAIRS:
         raise ValueError(
             f"{len(pairs)} results are there with both roundings, at least {_FEWEST_PAIRS} are needed for tolerances: "
@@ -43,8 +48,7 @@ def rounding_tolerances(
     found = {}
     for key, rule in tolerances.items():
         changes = [there[key] - here[key] for here, there in pairs if key in here and key in there]
-        square = sum(change**2 for change in changes) / max(len(changes), 1)
-        least = _DEVIATIONS * math.sqrt(square / num_seeds)
+        least = _DEVIATIONS * math.sqrt(sum(change**2 for change in changes) / max(len(changes), 1) / num_seeds)
         found[key] = {**rule, "tolerance": max(float(rule["tolerance"]), float(f"{least:.2g}"))}
     return found
 
@@ -58,8 +62,8 @@ def write_gate(path: str | os.PathLike, rows: Sequence[Row], tolerances: Mapping
     baseline = {}
     for row in rows:
         if row.kind == "ours" and row.seeds:
-            known = {key: rule for key, rule in tolerances.items() if row.values.get(key) is not None}
-            metrics = {key: {"value": row.values[key], **rule} for key, rule in known.items()}
+            values = {key: row.values.get(key) for key in tolerances}
+            metrics = {key: {"value": one, **tolerances[key]} for key, one in values.items() if one is not None}
             baseline[_name(row)] = {"protocol": row.protocol, "seeds": list(row.seeds), "metrics": metrics}
     if not baseline:
         raise ValueError(f"{path} is not written: there is no result of ours to take a baseline from")
@@ -74,7 +78,7 @@ def read_gate(path: str | os.PathLike) -> dict[str, Any]:
     remedy = "write one with python -m experiments.evaluate … write_gate=FILE"
     if not Path(path).is_file():
         raise ValueError(f"gate={path} is no file: {remedy}")
-    try:
+    with sound(f"gate={path} is no baseline", remedy):
         content = yaml.safe_load(Path(path).read_text(encoding="utf-8"))
         if content["format"] != GATE_FORMAT:
             raise ValueError(f"format {content['format']}, not {GATE_FORMAT}")
@@ -84,8 +88,6 @@ def read_gate(path: str | os.PathLike) -> dict[str, Any]:
                     raise ValueError(f"{key} needs direction: lower or higher, and a tolerance of 0 or more")
                 float(rule["value"])
             entry["protocol"], [int(seed) for seed in entry["seeds"]]
-    except (yaml.YAMLError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"gate={path} is no baseline ({error!r}): {remedy}") from error
     return content["baseline"]
 
 
@@ -107,10 +109,6 @@ def regressions(baseline: Mapping[str, Any], rows: Sequence[Row]) -> list[str]:
                 allowed = f"{rule['direction']} is better, tolerance {tolerance:g}"
                 lines.append(f"{name}: {key} is {shown}, baseline {rule['value']:.6g} ({allowed})")
     return lines
-
-
-def _job(item: Estimate) -> tuple[str, str, str, str, int]:
-    return item.dataset, item.sequence, item.variant, item.protocol, item.seed
 
 
 def _name(row: Row) -> str:

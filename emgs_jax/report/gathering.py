@@ -1,7 +1,7 @@
 """Data gathered for comparison while a sequence is mapped: the raw predictions, and baselines."""
 
 from collections.abc import Iterable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import equinox as eqx
@@ -26,19 +26,12 @@ Text = tuple[tuple[str, ...], np.ndarray]  # names of classes and their embeddin
 
 @dataclass(frozen=True)
 class RawPrior:
-    """Raw predictions of a sequence, without any mapping.
+    """Raw predictions of a sequence, without any mapping."""
 
-    Args:
-        cloud: its points at its poses; a voxel's side in its lengths is known once the poses are aligned.
-        points: camera-frame points of each frame (h, w, 3), in the prior's own lengths; 0 where it says nothing.
-        classes: of each frame's pixels (h, w), as positions in the prior's names, -1 = none; None without classes.
-        labels: its points likewise, each with the class that its frame sees there; None without classes.
-    """
-
-    cloud: SpooledCloud
-    points: Spool
-    classes: Spool | None = None
-    labels: SpooledLabels | None = None
+    cloud: SpooledCloud  # its points at its poses; a voxel's side in its lengths is known once the poses are aligned
+    points: Spool  # in the camera's frame, of each frame (h, w, 3), in the prior's own lengths; 0 where it says nothing
+    classes: Spool | None = None  # of each frame's pixels (h, w), as positions in the prior's names, -1 = none
+    labels: SpooledLabels | None = None  # its points, each with the class that its frame sees there
 
 
 class Baselines:
@@ -61,9 +54,10 @@ class Baselines:
         """Add the frame of a record, with its points (h, w, 3), which are known, and its pose as the prior says it."""
         row = len(self.poses)
         self.poses.append(record.pose)
-        if self._configs:
-            self._fuse(self.raw, row, view, raw_pose, 1.0)
-        if record.status in IN_MAP and self._configs:
+        if not self._configs:
+            return
+        self._fuse(self.raw, row, view, raw_pose, 1.0)
+        if record.status in IN_MAP:
             taken = np.asarray(has_normal(points, mask, self._observation))
             cloud = PointCloud(*(values[taken[mask]] for values in vars(view.cloud).values()))
             view = View(np.where(taken, view.depth, np.float32(0.0)), view.image, cloud)
@@ -118,11 +112,9 @@ def gather(
         cloud.append(posed(seen, pose))
 
     with ThreadPoolExecutor(1, "raw prior") as thread:
-        taken: Future[None] | None = None
+        taken = thread.submit(int)
         for record, view in frames:
-            if taken is not None:
-                taken.result()  # one at a time: no more of them are in memory, and an error ends the mapping
+            taken.result()  # one at a time: no more of them are in memory, and an error ends the mapping
             taken = thread.submit(take, record, view)
-        if taken is not None:
-            taken.result()
-    return RawPrior(cloud, kept) if text is None else RawPrior(cloud, kept, classes, labels)
+        taken.result()
+    return RawPrior(cloud, kept, None if text is None else classes, labels)

@@ -46,25 +46,17 @@ DATA_LICENCES = {
 
 
 class Head(NamedTuple):
-    """The top of a page, and its foot.
-
-    Args:
-        title: of the page, with `beside` in small letters.
-        level: of the verdict: good, mixed, bad or unknown.
-        remarks: side remarks; empty ones are left out.
-        command: repeats what the page shows; "" where nobody knows.
-        sources: data sets and priors whose licences stand at the foot.
-    """
+    """The top of a page, and its foot."""
 
     window: str
     title: str
-    beside: str
-    level: str
+    beside: str  # the title, in small letters
+    level: str  # of the verdict: good, mixed, bad or unknown
     verdict: str
     is_simulated: bool
-    remarks: Sequence[str]
-    command: str
-    sources: Sequence[tuple[str, str]]
+    remarks: Sequence[str]  # empty ones are left out
+    command: str  # repeats what the page shows; "" where nobody knows
+    sources: Sequence[tuple[str, str]]  # data sets and priors whose licences stand at the foot
 
 
 def page(template: str, head: Head, policy: str = POLICY, **values: Any) -> bytes:
@@ -125,10 +117,9 @@ def thumbnails(paths: Sequence[Path], widths: Sequence[int] = _WIDTHS) -> list[s
         try:
             with Image.open(path) as image:
                 images.append(image.convert("RGB"))
+            images[-1].thumbnail((widths[0], 4 * widths[0]))
         except (OSError, SyntaxError, ValueError):  # not there, or damaged; Pillow has all three
             images.append(None)
-            continue
-        images[-1].thumbnail((widths[0], 4 * widths[0]))
     for width in widths:
         for image in filter(None, images):
             image.thumbnail((width, 4 * width))

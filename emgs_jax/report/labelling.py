@@ -6,10 +6,10 @@ from functools import cached_property
 import jax
 import numpy as np
 from jaxtyping import Float, Int
-from scipy.spatial import cKDTree
 
 from emgs_jax.device.arrays import on_device
 from emgs_jax.device.executables import stored
+from emgs_jax.evaluation.clouds import NearestPoints
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.mapping.run import MappingRun
@@ -23,18 +23,13 @@ _classify, _similarities = stored(classify), stored(similarities)
 
 @dataclass(frozen=True)
 class LabelledMap:
-    """Gaussians with what they know of classes.
+    """Gaussians with what they know of classes."""
 
-    Args:
-        means: (n, 3), m.
-        whiten: (n, 3, 3), inverse of the Cholesky factors of the covariances.
-        evidence: (n, c), the feature's projection on the text of each class. Features are sums over the points of all
-            views (R16), so its size says how much is known.
-    """
-
-    means: np.ndarray
-    whiten: np.ndarray
-    log_dets: np.ndarray
+    means: np.ndarray  # (n, 3), m
+    whiten: np.ndarray  # (n, 3, 3), inverse of the Cholesky factors of the covariances
+    log_dets: np.ndarray  # (n,), of the covariances
+    # (n, c), the feature's projection on the text of each class. Features are sums over the points of all views (R16),
+    # so its size says how much is known.
     evidence: np.ndarray
     classes: tuple[str, ...]
 
@@ -43,15 +38,15 @@ class LabelledMap:
         """The class of each Gaussian by itself, a position in `classes`."""
         return self.evidence.argmax(1)
 
+    @cached_property
+    def nearest(self) -> NearestPoints:
+        """Search among the means."""
+        return NearestPoints(self.means)
+
     @property
     def centers(self) -> LabelledPoints:
         """The means with their classes."""
         return LabelledPoints(self.means, self.labels, self.classes)
-
-    @cached_property
-    def tree(self) -> cKDTree:
-        """Of the means."""
-        return cKDTree(self.means)
 
     def classes_of(self, points: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
         """The class with most evidence at each point: argmax_c Σ_k r_k e_kc; -1 without Gaussians.
@@ -62,8 +57,7 @@ class LabelledMap:
         """
         if not len(self.means):
             return np.full(len(points), -1)
-        k = min(NUM_NEIGHBOURS, len(self.means))
-        rows = self.tree.query(points, [*range(1, k + 1)], workers=-1)[1]
+        rows = self.nearest.query(points, NUM_NEIGHBOURS)[1]
         votes = self.labels[rows]
         classes = votes[:, 0].copy()
         # Where all neighbours have one class it is that one; the others are few, and the memory for them is bounded.
@@ -80,11 +74,7 @@ class LabelledMap:
 
 
 def labelled_map(run: MappingRun, prior: Prior) -> LabelledMap | None:
-    """The confirmed Gaussians that have a feature, with its projection on each class's text; None without classes.
-
-    Raises:
-        ValueError: the embeddings' width differs from the features'.
-    """
+    """The confirmed Gaussians that have a feature, with its projection on each class's text; None without classes."""
     gaussians = confirmed(run.state.map)
     if not prior.feature_names or not gaussians.features.shape[-1]:
         return None

@@ -6,31 +6,38 @@ import zlib
 from collections.abc import Collection, Mapping
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import matplotlib
 import numpy as np
+from scipy.spatial import cKDTree
 
 from emgs_jax.device.arrays import on_device
 from emgs_jax.device.executables import stored
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import GaussianMap, confirmed
+from emgs_jax.gaussians import Gaussians
 from emgs_jax.report.colors import NO_CLASS, class_colors, rgb, to_bytes
-from emgs_jax.report.display import closing_covariances
 from emgs_jax.semantics import principal_colors, similarities
 
 COV_UNIT = 1e-4  # m²; float16 then holds standard deviations from .1 mm to 2.5 m
 _LARGEST_HALF = 65504.0
 _similarities, feature_colors = stored(similarities), stored(principal_colors)
 _UPPER = np.triu_indices(3)
+# Gaussians as viewers draw them are wide enough along the surface that it has no gaps.
+_NUM_NEIGHBOURS = 6  # as many as touch a disc in a dense packing
+_REACH = 2.0  # standard deviations at which a neighbour may be: opacities of .9 then add up to .9 between them and more
+_CANDIDATES = 18  # nearest means, of which those that face another way are no neighbours
+_MIN_COSINE = 0.7  # between the normals of neighbours on one surface
+LARGEST = 3.0  # times its width that a Gaussian becomes at most: one that stands alone stays a spot
 
 
 class Layer(NamedTuple):
-    """A layer that a viewer can show.
+    """A layer that a viewer can show: an array of `map_layers` or `feature_layer`.
 
-    Args:
-        array: of `map_layers` or `feature_layer`, which it shows.
-        scale: of numbers that get their colour from their place between the 1st and the 99th percentile: `share` of
-            255, `count` (its logarithm) or `number`; "" where the array has colours of its own.
+    With a `scale` its numbers get their colour from their place between the 1st and the 99th percentile: `share` of
+    255, `count` (its logarithm) or `number`.
     """
 
     title: str
@@ -83,6 +90,33 @@ def covariances(arrays: Mapping[str, np.ndarray]) -> np.ndarray:
 def packed_covariances(covs: np.ndarray) -> np.ndarray:
     """Pack covariances (n, 3, 3) as float16 (n, 6): the upper triangles in `COV_UNIT`."""
     return np.clip(covs[:, *_UPPER] / COV_UNIT, -_LARGEST_HALF, _LARGEST_HALF).astype(np.float16)
+
+
+def closing_covariances(means: np.ndarray, covs: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """Covariances (n, 3, 3) that close the surface in an ordinary 3DGS rasteriser; for display only, float64.
+
+    Each is widened along its surface until its sixth neighbour lies at `_REACH` standard deviations, measured with its
+    own covariance, so that it keeps its shape; none is narrowed, and the thickness along the unit normal stays.
+    """
+    means, covs, normals = (np.asarray(values, np.float64) for values in (means, covs, normals))
+    if len(means) < 2:
+        return covs
+    rows = cKDTree(means).query(means, k=min(_CANDIDATES + 1, len(means)))[1][:, 1:]
+    plane = np.eye(3) - normals[:, :, None] * normals[:, None]
+    offsets = (means[rows] - means[:, None]) @ plane
+    distance_sq = np.einsum("nki,nij,nkj->nk", offsets, np.linalg.inv(covs), offsets)
+    faces_alike = np.einsum("nki,ni->nk", normals[rows], normals) > _MIN_COSINE
+    distance_sq = np.sort(np.where(faces_alike, distance_sq, np.inf), axis=1)
+    widening = np.clip(distance_sq[:, min(_NUM_NEIGHBOURS, rows.shape[1]) - 1] / _REACH**2, 1.0, LARGEST**2)
+    return covs + (widening - 1.0)[:, None, None] * (plane @ covs @ plane)
+
+
+def closed(gaussians: Gaussians) -> Gaussians:
+    """The same Gaussians with `closing_covariances`; for display only."""
+    rows = np.flatnonzero(gaussians.valid)
+    covs = np.array(gaussians.covs)
+    covs[rows] = closing_covariances(*(np.asarray(x)[rows] for x in (gaussians.means, covs, gaussians.normals)))
+    return eqx.tree_at(lambda g: g.covs, gaussians, jnp.asarray(covs))
 
 
 def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.ndarray]:
@@ -143,13 +177,8 @@ def fitted(
 ) -> tuple[list[dict[str, Any]], str, int]:
     """Pack at most `limit` characters, with fewer Gaussians where all of them are too many; the last item is how many.
 
-    The paths of some 15,000 frames are too many by themselves: then there is no Gaussian.
-
-    Args:
-        layers: attributes of the Gaussians, by name.
-        paths: other arrays, which stay whole.
-        weight: of the Gaussians: those of most are kept.
-        limit: characters.
+    Those of most weight are kept; `paths` stay whole. The paths of some 15,000 frames are too many by themselves: then
+    there is no Gaussian.
     """
     count = len(weight)
     about, text = packed({**layers, **paths})

@@ -7,7 +7,7 @@ next one is made. The run waits for nothing that is drawn.
 import contextlib
 import time
 from collections.abc import Iterator, Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -31,77 +31,58 @@ IMAGE_WIDTH = 320  # pixels
 
 @dataclass(frozen=True)
 class LiveConfig:
-    """Settings of the live view of a run that maps.
+    """Settings of the live view of a run that maps."""
 
-    Args:
-        port: on 127.0.0.1.
-        every_s: seconds between two pictures, at least.
-    """
-
-    port: int = number(low=1, high=65535)
-    every_s: float = number(low=0.1, high=3600)
+    port: int = number(low=1, high=65535)  # on 127.0.0.1
+    every_s: float = number(low=0.1, high=3600)  # seconds between two pictures, at least
 
 
 class LiveView:
-    """A run that is watched until `stop`.
+    """A run that is watched until `stop`; ValueError where the port is taken, or viser is not installed.
 
     Args:
         text: classes that features are compared with; None without.
         kept: index in the data set of each frame in use.
-
-    Raises:
-        ValueError: the port is taken, or viser is not installed.
     """
 
     def __init__(self, config: LiveConfig, start: Shown, text: TextEmbeddings | None, kept: Sequence[int]) -> None:
         self.viewer, self._every_s = Viewer(start, config.port), config.every_s
         self._start, self._text, self._kept = start, text, kept
         self._thread, self._due = ThreadPoolExecutor(1, "live view"), 0.0
-        self._drawing: Future | None = None
+        self._drawing, self._has_failed = self._thread.submit(int), False
         self._image: np.ndarray | None = None  # of the last frame
-        self._failure: BaseException | None = None
 
     def show(self, run: MappingRun, image: np.ndarray) -> None:
         """Show a run as it is, with the image of its last frame, where that is due and nothing is being drawn."""
         self._image = image
-        if time.monotonic() >= self._due and self._is_idle():
+        if time.monotonic() >= self._due and self._drawing.done():
             self._begin(run)
 
     def show_last(self, run: MappingRun) -> None:
         """Show a finished run, and wait until it is drawn."""
         self.wait()
-        if self._is_idle() and self._image is not None:
+        if self._image is not None:
             self._begin(run)
             self.wait()
-            self._is_idle()
 
     def wait(self) -> None:
         """Wait until nothing is being drawn."""
-        if self._drawing is not None:
-            self._drawing.exception()
+        self._drawing.result()
 
     def stop(self) -> None:
         """End the server."""
         self._thread.shutdown()
         self.viewer.stop()
 
-    def _is_idle(self) -> bool:
-        """Test whether the thread can draw; a failure is printed, once, and the run continues without the live view."""
-        if self._failure is None and self._drawing is not None and self._drawing.done():
-            self._failure = self._drawing.exception()
-            if self._failure is not None:
-                tqdm.write(f"the live view stays as it is, and the run goes on: {self._failure!r}")
-        return self._failure is None and (self._drawing is None or self._drawing.done())
-
     def _begin(self, run: MappingRun) -> None:
-        if run.map is not None:
+        if run.map is not None and not self._has_failed:
             self._drawing = self._thread.submit(self._draw, run.map, run.records, self._image)
 
     def _draw(self, map: GaussianMap, records: Sequence[FrameRecord], image: np.ndarray) -> None:
-        begin = time.monotonic()
-        step = -(-image.shape[1] // IMAGE_WIDTH)
-        self.viewer.update(
-            replace(
+        """Draw; a failure is printed, once, and the run continues without the live view."""
+        begin, step = time.monotonic(), -(-image.shape[1] // IMAGE_WIDTH)
+        try:
+            shown = replace(
                 self._start,
                 layers=map_layers(map, self._text),
                 frames=[vars(record) | {"index": self._kept[record.index]} for record in records],
@@ -109,7 +90,10 @@ class LiveView:
                 truth=np.full((len(records), 3), np.nan),
                 image=with_moving(np.ascontiguousarray(image[::step, ::step]), vars(records[-1])),
             )
-        )
+            self.viewer.update(shown)
+        except Exception as error:  # whatever it is
+            self._has_failed = True
+            tqdm.write(f"the live view stays as it is, and the run goes on: {error!r}")
         end = time.monotonic()
         self._due = end + max(self._every_s, (end - begin) / SHARE)
 
@@ -118,11 +102,7 @@ class LiveView:
 def live_view(
     config: LiveConfig | None, run: MappingRun, render: RenderConfig, prior: Prior, kept: Sequence[int]
 ) -> Iterator[LiveView | None]:
-    """Serve a run inside the `with`, and say where; None, and nothing is served, without a config.
-
-    Args:
-        kept: index in the data set of each frame in use.
-    """
+    """Serve a run inside the `with`, and say where; None, and nothing is served, without a config."""
     if config is None:
         yield None
         return

@@ -68,12 +68,11 @@ def config_of(run: FinishedRun) -> DictConfig:
 def record_of(line: Mapping[str, Any], pose: np.ndarray) -> FrameRecord:
     """Read a record from its line of frames.jsonl; `pose` is that of the finished run."""
 
-    def read(name: str, value: Any) -> Any:
-        is_pose = name.endswith("pose") and value is not None
-        return from_tum(np.array([value], np.float64))[0] if is_pose else value
-
-    names = {field.name for field in fields(FrameRecord)}
-    return FrameRecord(**{name: read(name, value) for name, value in line.items() if name in names} | {"pose": pose})
+    known = {field.name: line[field.name] for field in fields(FrameRecord) if field.name in line}
+    for name, value in known.items():
+        if name.endswith("pose") and value is not None:
+            known[name] = from_tum(np.array([value], np.float64))[0]
+    return FrameRecord(**known | {"pose": pose})
 
 
 def with_records(end: BackEnd, records: Sequence[FrameRecord], online: np.ndarray) -> tuple[BackEnd, Sequence[Node]]:
@@ -98,14 +97,8 @@ def with_records(end: BackEnd, records: Sequence[FrameRecord], online: np.ndarra
 def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, list[int], dict[int, str]]:
     """Join all runs with the first one, each where it shows places of it or of one that is joined already.
 
-    Args:
-        has_truth: the true poses of all are in one world; False: they are left out.
-
-    Returns:
-        The run of all, the order in which their frames are in it, and why a run of these was not joined.
-
-    Raises:
-        ValueError: none can be joined with the first.
+    Returns the run of all, the order in which their frames are in it, and why a run of these was not joined. Without
+    `has_truth` the true poses are not in one world, and left out. ValueError where none can be joined with the first.
     """
     atlas, order, pending, reasons = runs[0].atlas, [0], [*range(1, len(runs))], {}
     while pending:
@@ -121,16 +114,12 @@ def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, l
         reasons.pop(number, None)
     if len(order) == 1:
         why = "; ".join(f"{runs[number].finished.folder}: {reason}" for number, reason in reasons.items())
-        raise ValueError(
-            f"none of the runs can be joined with {runs[0].finished.folder}, so there is no merged run: {why}"
-        )
+        raise ValueError(f"none can be joined with {runs[0].finished.folder}, so there is no merged run: {why}")
     for number in pending:
         atlas, order = beside(atlas, runs[number].atlas), [*order, number]
     atlas = set_unjoined_apart(atlas, kept=0)
-    records = [record for number in order for record in runs[number].records]
-    records = [
-        replace(one, index=row, true_pose=one.true_pose if has_truth else None) for row, one in enumerate(records)
-    ]
+    records = enumerate(record for number in order for record in runs[number].records)
+    records = [replace(one, index=row, true_pose=one.true_pose if has_truth else None) for row, one in records]
     records = with_unjoined_apart(records, atlas.graph.nodes, kept=0)
     atlas = numbered(finish_back_end(atlas))
     records = with_moved_nodes(records, (), atlas.graph.nodes)
@@ -149,8 +138,7 @@ def numbered(atlas: Atlas) -> Atlas:
 def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[dict[str, Any], list[str]]:
     """Write a merged run into a new folder, with unit and world of the first run.
 
-    Returns:
-        Its metrics; and what there is to say: which run was not joined and why, and what could not be made.
+    Returns its metrics; and what there is to say: which run was not joined and why, and what could not be made.
     """
     read = [mergeable(folder) for folder in folders]
     run, order, reasons = merged(read, has_truth)

@@ -24,14 +24,12 @@ from emgs_jax.evaluation.reconstruction import (
 )
 from emgs_jax.evaluation.rendering import Rendered
 from emgs_jax.evaluation.segmentation import (
-    DistinctCells,
     LabelledPoints,
     SpooledLabels,
+    TrueLabels,
     align_labels,
     compare_labels,
-    label_cells,
     translate,
-    true_labels,
 )
 from emgs_jax.evaluation.trajectory import align_poses, trajectory_metrics
 from emgs_jax.gaussian_map import confirmed
@@ -53,27 +51,22 @@ STATUSES = ("tracked", "degraded", "lost", APART, "initialization")
 
 @dataclass(frozen=True)
 class Scorer:
-    """References that all maps of one data set are compared with, made once.
-
-    Args:
-        truth: the true cloud, empty without ground truth.
-        labels: the true classes; None where data set or prior have none.
-        prior: its text embeddings are the classes of a map.
-    """
+    """References that all maps of one data set are compared with, made once."""
 
     dataset: ReadableFrames
     evaluation: EvaluationConfig
-    truth: Reference
-    labels: LabelledPoints | None
-    prior: Prior | None
+    truth: Reference  # empty without ground truth
+    labels: LabelledPoints | None  # the true classes; None where data set or prior have none
+    prior: Prior | None  # its text embeddings are the classes of a map
 
 
 def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior) -> Scorer:
     """Read the truth of a data set, each frame once."""
-    cells = None if compared_text(dataset, prior) is None else DistinctCells()
-    truth = true_cloud(dataset, evaluation, cells)
-    labels = None if cells is None else true_labels(cells, dataset, evaluation.voxel_m)
-    return Scorer(dataset, evaluation, truth, labels, prior)
+    labels = None
+    if compared_text(dataset, prior) is not None:
+        labels = TrueLabels(dataset, evaluation.voxel_m, evaluation.max_depth_m)
+    truth = true_cloud(dataset, evaluation, labels)
+    return Scorer(dataset, evaluation, truth, labels and labels.points(), prior)
 
 
 def compared_text(dataset: ReadableFrames, prior: Prior) -> Text | None:
@@ -81,14 +74,14 @@ def compared_text(dataset: ReadableFrames, prior: Prior) -> Text | None:
     return (tuple(prior.feature_names), prior.text_features) if dataset.classes and prior.feature_names else None
 
 
-def true_cloud(dataset: ReadableFrames, config: EvaluationConfig, cells: DistinctCells | None = None) -> Reference:
-    """The true points of the frames whose pose is known; `cells` takes the `label_cells` of each frame on the way."""
+def true_cloud(dataset: ReadableFrames, config: EvaluationConfig, labels: TrueLabels | None = None) -> Reference:
+    """The true points of the frames whose pose is known; `labels` take each frame on the way."""
 
     def frames() -> Iterator[Frame]:
         for row in range(len(dataset) if dataset.has_ground_truth else 0):
             frame = dataset[row]
-            if cells is not None:
-                cells.append(label_cells(frame, dataset, config.voxel_m, config.max_depth_m))
+            if labels is not None:
+                labels.append(frame)
             yield frame
 
     return reference(ground_truth_cloud(frames(), dataset.intrinsics, config), config)
@@ -135,7 +128,8 @@ def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
         return {}
     rendered = Rendered(scorer.dataset, poses, scorer.evaluation, has_classes=raw.classes is not None)
     for row in range(len(raw.points)):
-        rendered.add(row, raw.points[row][..., 2], None, _own_classes(raw, row, scorer))
+        names = None if raw.classes is None else (scorer.prior.feature_names, scorer.dataset.classes)
+        rendered.add(row, raw.points[row][..., 2], None, names and translate(raw.classes[row], *names))
     with ThreadPoolExecutor(1, "classes of the raw prior") as thread:
         of_labels = thread.submit(_score_labels, raw.labels, poses, scorer)
         metrics = trajectory_metrics(*poses) | score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
@@ -152,30 +146,26 @@ def _score_labels(
     return compare_labels(aligned, scorer.labels, scorer.evaluation.label_neighbours)
 
 
-def _own_classes(raw: RawPrior, row: int, scorer: Scorer) -> np.ndarray | None:
-    """Return the prior's own classes of a frame's pixels, as positions in the data set's; None without any."""
-    if raw.classes is None:
-        return None
-    return translate(raw.classes[row], scorer.prior.feature_names, scorer.dataset.classes)
-
-
 def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer: Scorer) -> Metrics:
     """Reconstruction and rendering metrics of every baseline, aligned by the poses that it was built at.
 
     Rendered is each frame whose pose is known: at our poses those that are not lost, at the prior's those with points.
     """
-    is_known = [record.status not in UNPLACED for record in run.records]
+    is_known = {
+        "raw": [raw.points[row].any() for row in range(len(raw.points))],
+        "ours": [record.status not in UNPLACED for record in run.records],
+    }
     metrics: Metrics = {}
-    for fusions, poses, rows, kind in (
-        (baselines.raw, run.raw_poses, [raw.points[row].any() for row in range(len(raw.points))], "raw"),
-        (baselines.ours, np.stack(baselines.poses), is_known, "ours"),
+    for kind, fusions, poses in (
+        ("raw", baselines.raw, run.raw_poses),
+        ("ours", baselines.ours, np.stack(baselines.poses)),
     ):
         compared = with_truth(run, poses)
         if compared is None:
             return {}
         for name, fusion in fusions.items():
             rendered, draw = Rendered(scorer.dataset, compared, scorer.evaluation), fusion.renderer()
-            for row in np.flatnonzero(rows):
+            for row in np.flatnonzero(is_known[kind]):
                 rendered.add(int(row), *draw(poses[row]))
             found = score_cloud(fusion.cloud(), compared, scorer) | rendered.metrics()
             metrics |= prefixed(found, f"baseline_{name}_{kind}/")
@@ -183,17 +173,9 @@ def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer
 
 
 def score_settings(
-    runs: Sequence[MappingRun],
-    raw: RawPrior,
-    densify: Sequence[DensifyConfig],
-    scorer: Scorer,
-    num_threads: int,
+    runs: Sequence[MappingRun], raw: RawPrior, densify: Sequence[DensifyConfig], scorer: Scorer, num_threads: int
 ) -> list[Metrics]:
-    """The metrics.json of every finished run, without times.
-
-    Args:
-        raw: what the prior alone says, the same for all.
-    """
+    """The metrics.json of every finished run, without times; what the prior alone says is the same for all."""
 
     def score(run: MappingRun, config: DensifyConfig) -> Metrics:
         counts = {k: v for k, v in describe(run, scorer.dataset).items() if not k.startswith("time/")}
@@ -214,14 +196,20 @@ def score_settings(
 def describe(run: MappingRun, dataset: ReadableFrames | None = None) -> Metrics:
     """Size of the map, how many frames came to what, time and memory; without a data set none was left out."""
     statuses = Counter(record.status for record in run.records)
-    metrics: Metrics = {"map/num_gaussians": int(np.asarray(confirmed(run.state.map).valid).sum())}
-    metrics["map/double_wall_percent"] = double_walls(confirmed(run.state.map), metre(run))
+    gaussians = jax.device_get(confirmed(run.state.map))
+    metrics: Metrics = {"map/num_gaussians": int(gaussians.valid.sum())}
+    metrics["map/double_wall_percent"] = _double_walls(gaussians, run)
     metrics["map/num_tentative"] = int(np.asarray(run.state.map.gaussians.valid).sum()) - metrics["map/num_gaussians"]
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
     metrics["frames/skipped"] = 0 if dataset is None else len(dataset.skipped)
-    for number in run.apart:
-        metrics |= _submap_metrics(run, number)
+    for number in run.apart:  # its frames, and the error of its path in its own unit
+        records = records_apart(run.records, number)
+        known = [(record.pose, record.true_pose) for record in records if record.true_pose is not None]
+        metrics[f"submaps/{number}/frames"] = len(records)
+        if len(known) >= 3:
+            errors = trajectory_metrics(*map(np.stack, zip(*known, strict=True)))
+            metrics[f"submaps/{number}/ate_sim3_m"] = errors["trajectory/ate_sim3_m"]
     metrics["submaps/unjoined_frames"] = sum(record.reason == UNJOINED for record in run.records)
     row = longest_row(run.records)
     metrics["frames/longest_untracked"] = len(row)
@@ -232,28 +220,12 @@ def describe(run: MappingRun, dataset: ReadableFrames | None = None) -> Metrics:
     return metrics
 
 
-def _submap_metrics(run: MappingRun, number: int) -> Metrics:
-    """`submaps/N/…` of a submap that was never joined: its frames, and the error of its path in its own unit."""
-    records = records_apart(run.records, number)
-    known = [(record.pose, record.true_pose) for record in records if record.true_pose is not None]
-    found: Metrics = {f"submaps/{number}/frames": len(records)}
-    if len(known) >= 3:
-        ate = trajectory_metrics(*map(np.stack, zip(*known, strict=True)))["trajectory/ate_sim3_m"]
-        found[f"submaps/{number}/ate_sim3_m"] = ate
-    return found
-
-
-def metre(run: MappingRun) -> float | None:
-    """A metre in the map's unit, as the true path says; None without one."""
+def _double_walls(gaussians: Gaussians, run: MappingRun) -> float | None:
+    """Per cent of valid Gaussians on the host that another stands behind; a metre is what the true path says."""
     poses = with_truth(run, run.poses)
-    return None if poses is None else 1.0 / align_poses(*poses, with_scale=True)[0].scale
-
-
-def double_walls(gaussians: Gaussians, metre: float | None) -> float | None:
-    """Per cent of valid Gaussians that another stands behind, see `double_wall_share`."""
-    rows = jax.device_get(gaussians)
-    means, normals, covs = (values[rows.valid] for values in (rows.means, rows.normals, rows.covs))
-    share = double_wall_share(means, normals, covs, metre)
+    metre = None if poses is None else 1.0 / align_poses(*poses, with_scale=True)[0].scale
+    rows = (values[gaussians.valid] for values in (gaussians.means, gaussians.normals, gaussians.covs))
+    share = double_wall_share(*rows, metre)
     return None if share is None else 100.0 * share
 
 

@@ -8,23 +8,18 @@ from jaxtyping import Bool, UInt8
 
 from emgs_jax.data.reading import resize_nearest
 from emgs_jax.io.run_lengths import from_run_lengths
+from emgs_jax.report.results import sound
 
 MUCH = 0.03  # share of pixels; less may be wrong predictions
 _TINT, _OPACITY = np.array([0, 230, 0]), 0.6
 
 
 def moving_mask(line: Mapping[str, Any], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """What moves in the frame of a line of frames.jsonl, in an image of (width, height) `size`.
-
-    Raises:
-        ValueError: the line holds no mask.
-    """
+    """What moves in the frame of a line of frames.jsonl, in an image of (width, height); ValueError without a mask."""
     if not line.get("moving_pixels"):
         return np.zeros(size[::-1], bool)
-    try:
+    with sound(f"moving_pixels of frame {line.get('index')} in frames.jsonl is no mask"):
         found = from_run_lengths(line["moving_pixels"])
-    except (KeyError, TypeError, ValueError) as error:
-        raise ValueError(f"moving_pixels of frame {line.get('index')} in frames.jsonl is no mask: run again") from error
     return resize_nearest(found.astype(np.int32), size) > 0
 
 

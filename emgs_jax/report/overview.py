@@ -21,21 +21,13 @@ _INK, _PAPER = "#333333", "#e3e6ea"
 
 @dataclass(frozen=True)
 class Paths:
-    """Camera trajectories, (n, 4, 4) T_world_camera each, all in one frame; None where there is no such path.
-
-    Args:
-        estimate: of every frame.
-        is_placed: (n,), False where the camera was lost and a pose stands in for its own.
-        truth: aligned with the estimate; NaN where unknown.
-        online: as first estimated, before the back end moved poses.
-        loops: rows of the frames that loop closures join.
-    """
+    """Camera trajectories, (n, 4, 4) T_world_camera each, all in one frame; None where there is no such path."""
 
     estimate: np.ndarray
-    is_placed: np.ndarray
-    truth: np.ndarray | None = None
-    online: np.ndarray | None = None
-    loops: tuple[tuple[int, int], ...] = ()
+    is_placed: np.ndarray  # (n,), False where the camera was lost and a pose stands in for its own
+    truth: np.ndarray | None = None  # aligned with the estimate; NaN where unknown
+    online: np.ndarray | None = None  # as first estimated, before the back end moved poses
+    loops: tuple[tuple[int, int], ...] = ()  # rows of the frames that loop closures join
     unit: str = "m"
 
 
@@ -62,7 +54,10 @@ def draw_overview(
     axes = left.subplots(1 if features is None else 2, squeeze=False)[:, 0]
     _draw_map(axes[0], cloud, paths)
     if features is not None:
-        _draw_features(axes[1], features, paths)
+        rotation = view_from_above(paths.estimate)
+        _paint(axes[1], features, rotation, paths.estimate[:, :3, 3] @ rotation[2], (40, 250))
+        _bare(axes[1])
+        axes[1].set_title("features of the map, their main directions as colours", fontsize=11, color=_INK)
     if right is not None:
         grid = right.subplots(len(frames), 4 if classes else 3, squeeze=False)
         _draw_frames(grid[:, [0, 1, -1]], frames, paths.unit)
@@ -138,13 +133,10 @@ def seen_from_above(
 
 
 def thumbnail(points: np.ndarray, colors: np.ndarray, poses: np.ndarray, width: int = 240) -> Image.Image:
-    """Draw a small picture of a map from above with its path.
+    """Draw a small picture of a map from above with its path; `width` is the longer side.
 
-    Args:
-        points: (n, 3), in the frame of the poses; rows that are not finite are left out.
-        colors: (n, 3) RGB from 0 to 1.
-        poses: T_world_camera, (f, 4, 4).
-        width: pixels of the longer side.
+    Points (n, 3), with RGB (n, 3) in [0, 1], are in the frame of the poses T_world_camera (f, 4, 4); those that are not
+    finite are left out.
     """
     rotation = view_from_above(poses)
     path, finite = poses[:, :3, 3] @ rotation.T, np.isfinite(points).all(1)
@@ -175,11 +167,7 @@ def thumbnail(points: np.ndarray, colors: np.ndarray, poses: np.ndarray, width: 
 def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
     rotation = view_from_above(paths.estimate)
     path = paths.estimate[:, :3, 3] @ rotation.T
-    finite = np.isfinite(cloud.points).all(1)
-    points, colors = rotated(cloud.points[finite], rotation), cloud.colors[finite].clip(0.0, 1.0)
-    if len(points):
-        image, extent = seen_from_above(points, colors, path[:, 2])
-        axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)
+    count = _paint(axes, cloud, rotation, path[:, 2])
     for name, poses, label, width in (
         ("truth", paths.truth, "true path, where it fits best", 5.0),
         ("online", paths.online, "as it was placed", 1.6),
@@ -192,28 +180,26 @@ def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
         ends = path[np.array(paths.loops)]
         lines = axes.plot(*ends[..., :2].T, color=PATHS["loops"].paper, linewidth=1.6, zorder=3)
         lines[0].set_label(f"{len(ends)} loops")
-    axes.set_aspect("equal", adjustable="datalim")
     axes.set_facecolor(_PAPER)
     axes.set_xlabel({"m": "metres"}.get(paths.unit, paths.unit), color=_INK)
     axes.tick_params(colors=_INK, labelsize=9)
     axes.grid(color="white", linewidth=0.8)
     axes.set_axisbelow(True)
     axes.spines[:].set_visible(False)
-    axes.set_title(f"map from above, {len(points):,} points", fontsize=11, color=_INK)
+    axes.set_title(f"map from above, {count:,} points", fontsize=11, color=_INK)
     axes.legend(loc="upper right", fontsize=10, framealpha=0.9)
     _draw_scale_bar(axes, paths.unit)
 
 
-def _draw_features(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
-    rotation = view_from_above(paths.estimate)
+def _paint(axes: Axes, cloud: PointCloud, rotation: np.ndarray, heights: np.ndarray, *cells: tuple[int, int]) -> int:
+    """Paint the finite points of a cloud as `seen_from_above` has them; returns how many these are."""
     finite = np.isfinite(cloud.points).all(1)
     if finite.any():
-        heights = (paths.estimate[:, :3, 3] @ rotation.T)[:, 2]
-        image, extent = seen_from_above(cloud.points[finite] @ rotation.T, cloud.colors[finite], heights, (40, 250))
-        axes.imshow(image, extent=extent, origin="lower", interpolation="nearest")
+        points, colors = rotated(cloud.points[finite], rotation), cloud.colors[finite].clip(0.0, 1.0)
+        image, extent = seen_from_above(points, colors, heights, *cells)
+        axes.imshow(image, extent=extent, origin="lower", interpolation="nearest", zorder=1)
     axes.set_aspect("equal", adjustable="datalim")
-    _bare(axes)
-    axes.set_title("features of the map, their main directions as colours", fontsize=11, color=_INK)
+    return int(finite.sum())
 
 
 def _draw_path(axes: Axes, path: np.ndarray, color: str, label: str, width: float) -> None:
@@ -231,9 +217,8 @@ def _draw_scale_bar(axes: Axes, unit: str) -> None:
     length *= max(step for step in (1, 2, 5) if step * length <= (right - left) / 4)
     transform = axes.get_xaxis_transform()  # x in metres, y in shares of the axes
     start = left + 0.04 * (right - left)
-    axes.plot(
-        [start, start + length], [0.04, 0.04], color=_INK, linewidth=4, transform=transform, solid_capstyle="butt"
-    )
+    look = {"color": _INK, "linewidth": 4, "transform": transform, "solid_capstyle": "butt"}
+    axes.plot([start, start + length], [0.04, 0.04], **look)
     text = axes.text(start + length / 2, 0.055, f"{length:g} {unit}", transform=transform, ha="center", color=_INK)
     text.set_path_effects([withStroke(linewidth=3, foreground="white")])
 

@@ -8,15 +8,13 @@ from typing import Any
 
 import numpy as np
 from markupsafe import Markup
-from PIL import Image
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.io.files import jsonable
-from emgs_jax.render.composite import RenderConfig
 from emgs_jax.report import page_words
 from emgs_jax.report.colors import NO_CLASS, PATHS, class_colors, rgb, to_bytes
 from emgs_jax.report.finished_run import SPLATS_FILE, FinishedRun, PlacedPaths, placed_paths, render_config
-from emgs_jax.report.html import MAX_BYTES, POLICY, jpeg, page, picture, source, write_page
+from emgs_jax.report.html import MAX_BYTES, POLICY, page, picture, source, thumbnails, write_page
 from emgs_jax.report.layers import COV_UNIT, feature_layer, fitted, layers_of, map_layers, packed, thinned
 from emgs_jax.report.overview import view_from_above
 from emgs_jax.report.page_pictures import Views, draw_views
@@ -31,17 +29,13 @@ _SCRIPTS = ("data.js", "vectors.js", "splats.js", "layers.js", "controls.js", "o
 
 
 def write_report(run: FinishedRun, dataset: Dataset | None, note: str = "") -> Path:
-    """Write report.html into the folder of a run; the same run gives the same bytes.
+    """Write report.html into the folder of a run, and return its path; the same run gives the same bytes.
+
+    ValueError where parts of the run do not fit each other; then nothing is written.
 
     Args:
         dataset: in use, for the images; None: the page has none.
         note: what could not be shown, and why.
-
-    Returns:
-        The path of the page.
-
-    Raises:
-        ValueError: parts of the run do not fit each other; nothing is written.
     """
     paths = placed_paths(run)
     layers, config = map_layers(run.map, run.text) | feature_layer(run.map), render_config(run)
@@ -54,14 +48,10 @@ def write_report(run: FinishedRun, dataset: Dataset | None, note: str = "") -> P
     owned = {"owner": owners(means, kept)} if len(kept) else {}
     about_owned, packed_owners = packed(owned)
     few = f"The page shows the {shown:,} of {num:,} Gaussians that most frames agree on; map.npz has all of them."
-    about = _about(run, layers) | {"arrays": arrays, "render": _for_shader(config), "splats": splats}
-    about["owners"] = about_owned
+    render = {name: float(getattr(config, name)) for name in ("blur", "radius", "opacity")}
+    about = _about(run, layers) | {"arrays": arrays, "render": render, "splats": splats, "owners": about_owned}
     note = " ".join(filter(None, [note, few if shown < num else "", few_splats]))
     return write_page(run.folder, _page(run, paths, views, about, (packed_map, packed_splats, packed_owners), note))
-
-
-def _for_shader(config: RenderConfig) -> dict[str, float]:
-    return {name: float(getattr(config, name)) for name in ("blur", "radius", "opacity")}
 
 
 def _splats(run: FinishedRun) -> tuple[dict[str, Any] | None, str, str, np.ndarray]:
@@ -125,9 +115,10 @@ def _page(
     """Fill the page, with pictures of as many frames as fit."""
     script, again = Markup("\n".join(map(source, _SCRIPTS))), repeat(run.provenance["config"])
     digest = base64.b64encode(hashlib.sha256(script.encode()).digest()).decode("ascii")
+    (overview,) = thumbnails([run.folder / "overview.png"], (1200,))
     shown_paths = {array["name"] for array in about["arrays"]} | ({"loops"} if about["loops"] else set())
     values = {
-        "overview": _overview(run),
+        "overview": picture(overview, "the map from above, and some frames"),  # for who reads without a program
         "layers": layers_of({array["name"] for array in about["arrays"]}),
         "paths": {name: look for name, look in PATHS.items() if name in shown_paths},
         "depths": f"{views.near:.1f} to {views.far:.1f} {'m' if run.is_metric else 'units'}",
@@ -156,14 +147,3 @@ def _page(
         if len(content) <= MAX_BYTES or step >= max(len(pictures), 1):
             return content
         step += 1
-
-
-def _overview(run: FinishedRun) -> Markup:
-    """Show the picture of the run to who reads without a program."""
-    path = run.folder / "overview.png"
-    if not path.is_file():
-        return Markup()
-    with Image.open(path) as image:
-        small = image.convert("RGB")
-    small.thumbnail((1200, 1200))
-    return picture(jpeg(small), "the map from above, and some frames")

@@ -17,9 +17,9 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
 from emgs_jax.report.colors import to_bytes
-from emgs_jax.report.display import closed
 from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.report.html import jpeg
+from emgs_jax.report.layers import closed
 from emgs_jax.report.moving import with_moving
 
 WIDTH = 200  # pixels; a picture is not wider
@@ -50,12 +50,7 @@ def _drawn(gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: Rende
 
 
 def draw_views(run: FinishedRun, rows: Sequence[int], config: RenderConfig, dataset: Dataset | None) -> Views:
-    """Draw the map of a run by our own renderer from some frames, beside their images.
-
-    Args:
-        run: from a frame that is not placed, nothing is drawn.
-        dataset: for the images; None: without them.
-    """
+    """Draw the map of a run by our own renderer from frames that are placed, beside the images of a data set."""
     small, placed = downscale(run.camera, -(-run.camera.width // WIDTH)), run.is_placed
     gaussians = closed(confirmed(run.map))
     known = [row for row in rows if placed[row]]

@@ -3,21 +3,33 @@
 import json
 from collections import Counter
 from collections.abc import Mapping
-from typing import Any, NamedTuple
+from typing import Any
 
 from emgs_jax.loop_closure.two_view_alignment import Gate
 from emgs_jax.mapping.records import APART
-from emgs_jax.report import columns
-from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Line, Table
-from emgs_jax.report.finished_run import POLISH, FinishedRun, sound
+from emgs_jax.report.columns import (
+    BY_PATH,
+    MAIN,
+    PLACED,
+    RENDERED,
+    Column,
+    Line,
+    Table,
+    known,
+    metric_table,
+    transposed,
+)
+from emgs_jax.report.finished_run import POLISH, FinishedRun
 from emgs_jax.report.html import Head, commit_words
 from emgs_jax.report.moving import MUCH
-from emgs_jax.report.provenance import RAW_PRIOR, in_unit, length_words, lines_of
+from emgs_jax.report.printout import polish_table
+from emgs_jax.report.provenance import RAW_PRIOR, length_words, lines_of
 from emgs_jax.report.repeat import Repeated
+from emgs_jax.report.results import sound
 
 MANY_LOST = 0.1  # share of the frames
 MAX_LOOPS = 500  # that are named
-_SE3 = columns.Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
+_SE3 = Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
 _COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), _SE3, *PLACED[:1], *PLACED[3:4], *BY_PATH, *RENDERED)
 FILES = {
     "report.html": "this page; any browser of 2023 or later",
@@ -41,13 +53,6 @@ FILES = {
     "polish.txt": "poses as they moved with the splats, TUM format; evo",
     "cameras.ply": "every camera in the colour of its status, and the path, as a mesh; MeshLab, CloudCompare",
 }
-POLISHED = (  # key of polish.json, words, digits
-    ("psnr_db", "PSNR, dB", 2),
-    ("ssim", "SSIM", 3),
-    ("depth_within_5_percent", "depth within 5 %, %", 1),
-    ("depth_l1_m", "depth L1, m", 3),
-    ("ate_m", "ATE of all frames, m", 4),
-)
 GATES = {gate.value: gate.words for gate in Gate}
 OUTCOMES = {
     "accepted": "accepted",
@@ -68,14 +73,6 @@ def loop_words(run: FinishedRun, loop: dict[str, Any]) -> str:
     """Name frames, by their index in the data set as everywhere on the page, outcome and reason."""
     frame, other = (run.frames[loop[name]]["index"] for name in ("frame", "other"))
     return f"frames {frame} and {other}: {loop_why(loop)}"
-
-
-class Loops(NamedTuple):
-    """Candidates of loops: counts of their outcomes, what came of them, and each in words."""
-
-    outcomes: Table
-    closures: str
-    each: list[str]
 
 
 def verdict(run: FinishedRun) -> tuple[str, str]:
@@ -131,12 +128,12 @@ def errors(run: FinishedRun) -> Table | None:
     metrics = run.metrics
     if not any(MAIN[0].key in key for key in metrics):
         return None
-    all_columns = in_unit(_COLUMNS, [run.provenance["data"]["name"]])
-    lines = [line._replace(rivals=()) for line in lines_of(metrics, all_columns)]
+    lines = [line._replace(rivals=()) for line in lines_of(metrics, _COLUMNS)]
     online = {key: metrics.get(key.replace("trajectory/", "trajectory_online/")) for key, *_ in _COLUMNS[:2]}
     if any(value is not None for value in online.values()):
         lines.insert(1, Line(["ours, as placed"], online))
-    return columns.transposed(columns.metric_table([""], columns.known(all_columns, lines), lines))
+    columns = known(_COLUMNS, [line.values for line in lines])
+    return transposed(metric_table([""], columns, lines, [run.provenance["data"]["name"]]))
 
 
 def protocol_words(run: FinishedRun) -> str:
@@ -150,15 +147,15 @@ def protocol_words(run: FinishedRun) -> str:
     )
 
 
-def loops(run: FinishedRun) -> Loops | None:
-    """Count the outcomes of loop candidates with their reasons; None without a back end."""
+def loops(run: FinishedRun) -> tuple[Table, str, list[str]] | None:
+    """Candidates of loops: counts of their outcomes, what came of them, and each in words; None without a back end."""
     if not run.loops:
         return None
     counts = Counter(map(loop_why, run.loops)).most_common()
     each = [loop_words(run, loop) for loop in run.loops[:MAX_LOOPS]]
     each += [f"and {len(run.loops) - MAX_LOOPS} more in loops.json"] if len(run.loops) > MAX_LOOPS else []
     outcomes = Table(("candidates", "outcome"), [(f"{count}", words) for words, count in counts])
-    return Loops(outcomes, f"{run.metrics.get('loops/closures', 0)} closures moved poses and map.", each)
+    return outcomes, f"{run.metrics.get('loops/closures', 0)} closures moved poses and map.", each
 
 
 def settings(again: Repeated) -> Table:
@@ -175,13 +172,7 @@ def polished(run: FinishedRun) -> tuple[Table, str] | None:
     with sound(f"{path} is not what emgs polish writes", "polish again"):
         found = json.loads(path.read_text(encoding="utf-8"))
         count, held = (int(found[f"polish/{name}"]) for name in ("num_splats", "num_held_out"))
-        rows = [
-            (words, *(f"{float(found[f'polish/{when}_{name}']):.{digits}f}" for when in ("before", "after")))
-            for name, words, digits in POLISHED
-            if found.get(f"polish/before_{name}") is not None
-        ]
-    words = f"{count:,} splats; the {held} frames that are compared were not fitted."
-    return Table(("held-out frames", "map", "splats"), rows), words
+        return polish_table(found), f"{count:,} splats; the {held} frames that are compared were not fitted."
 
 
 def files(run: FinishedRun) -> Table:

@@ -17,11 +17,18 @@ from emgs_jax.mapping.records import (
     main_reason,
 )
 from emgs_jax.ops.ranges import MAX_LENGTH_M
-from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, aligned, metric_table
+from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Table, aligned, metric_table
 from emgs_jax.report.moving import MUCH
-from emgs_jax.report.provenance import in_unit, lines_of
+from emgs_jax.report.provenance import lines_of
 
 MANY = 0.1  # share of frames
+POLISHED = (  # key of polish.json, words, digits
+    ("psnr_db", "PSNR, dB", 2),
+    ("ssim", "SSIM", 3),
+    ("depth_within_5_percent", "depth within 5 %, %", 1),
+    ("depth_l1_m", "depth L1, m", 3),
+    ("ate_m", "ATE of all frames, m", 4),
+)
 
 
 def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
@@ -33,15 +40,11 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
     words = ("tracked", "degraded", "lost", "initialization", "skipped", *[APART] * bool(counts[APART]))
     lines = [f"{len(records) + num_skipped} frames: " + ", ".join(f"{counts[word]} {word}" for word in words)]
     if counts[APART]:
-        lines.append(
-            f"{counts[APART]} frames are in submaps that were never joined with the map; each is in submaps/ as it is: "
-            f"{REMEDIES[UNJOINED]}"
-        )
+        lines.append(f"{counts[APART]} frames are in submaps/, never joined with the map: {REMEDIES[UNJOINED]}")
     bad, row = [record for record in records if record.status in UNTRACKED], longest_row(records)
     if len(bad) > MANY * len(records) or len(row) >= MANY_IN_A_ROW:
         reason, count = main_reason(bad)
-        is_to_the_end = row.stop == len(records)
-        end = "to the end" if is_to_the_end else f"to {called(records[row[-1]])}"
+        end = "to the end" if row.stop == len(records) else f"to {called(records[row[-1]])}"
         where = f" ({len(row)} in a row, from {called(records[row[0]])} {end})" if len(row) > 1 else ""
         lines.append(f"{len(bad)} frames were not tracked{where}, {count} of them because {reason}: {REMEDIES[reason]}")
     if left_out := [record for record in records if record.left_out]:
@@ -89,7 +92,7 @@ def metrics_table(metrics: Mapping[str, Any]) -> str:
     names = [str((block.get("data") or {}).get("name"))]
     for columns in ((MAIN[0], *PLACED), (*BY_PATH, *RENDERED)):
         if lines := lines_of(metrics, columns):
-            tables.append(aligned(metric_table([_label(block)], in_unit(columns, names), lines)))
+            tables.append(aligned(metric_table([_label(block)], columns, lines, names)))
     return "\n\n".join(tables)
 
 
@@ -104,12 +107,17 @@ def _label(block: Mapping[str, Any]) -> str:
 def polish_lines(found: Mapping[str, Any]) -> list[str]:
     """Lines of what polish.json says of the frames that were held out."""
     lines = [f"{found['polish/num_splats']:,} splats; of {found['polish/num_held_out']} frames that were not fitted:"]
-    for name in ("psnr_db", "ssim", "depth_within_5_percent", "depth_l1_m", "ate_m"):
-        before, after = (found.get(f"polish/{when}_{name}") for when in ("before", "after"))
-        if before is not None and after is not None:
-            lines.append(f"{name:24} {before:8.4g} → {after:.4g}")
+    lines.append(aligned(polish_table(found)))
     if found["polish/after_psnr_db"] < found["polish/before_psnr_db"]:
-        lines.append(
-            "the splats show less than the map does: the frames are too few, or too far apart (dataset.stride=…)"
-        )
+        lines.append("the splats show less than the map: the frames are too few, or too far apart (dataset.stride=…)")
     return lines
+
+
+def polish_table(found: Mapping[str, Any]) -> Table:
+    """Map and splats beside each other on the frames that were held out, by polish.json."""
+    rows = [
+        (words, *(f"{float(found[f'polish/{when}_{name}']):.{digits}f}" for when in ("before", "after")))
+        for name, words, digits in POLISHED
+        if found.get(f"polish/before_{name}") is not None
+    ]
+    return Table(("held-out frames", "map", "splats"), rows)

@@ -1,10 +1,11 @@
 """Provenance of a run, and its metrics.json."""
 
+import contextlib
 import importlib.metadata
 import os
 import platform
 import subprocess
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ import jax
 from emgs_jax.data.base import Dataset
 from emgs_jax.io.files import flat, write_json
 from emgs_jax.prior.base import Provenance
-from emgs_jax.report.columns import Column, Line
+from emgs_jax.report.columns import OWN_UNITS, Column, Line
 
 RESULT_FORMAT = 1  # of metrics.json; another one is refused where results are read
 RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the prior without any mapping
@@ -25,14 +26,8 @@ ROWS = {  # prefix of the metrics of an estimate -> what it is
     "baseline_tsdf_raw/": "TSDF, raw poses",
     "baseline_tsdf_ours/": "TSDF, our poses",
 }
-_OWN_UNITS = ("colmap", "nerfstudio")  # data sets whose true poses are in a unit of their own
 _GROUPS = ("trajectory/", "reconstruction/", "segmentation/", "map/", "time/")
-_PACKAGES = {
-    "jax": ("jax",),
-    "jaxlib": ("jaxlib",),
-    "numpy": ("numpy",),
-    "optimistix": ("optimistix",),
-    "equinox": ("equinox",),
+_PACKAGES = {name: (name,) for name in ("jax", "jaxlib", "numpy", "optimistix", "equinox")} | {
     "open3d": ("open3d-cpu", "open3d"),
     "cv2": ("opencv-python-headless", "opencv-python"),
     "emgs_jax": ("emgs_jax",),
@@ -114,14 +109,7 @@ def is_metric(settings: Mapping[str, Any]) -> bool:
 
 def has_metric_truth(block: Mapping[str, Any]) -> bool:
     """Test whether the true poses of a result are in metres."""
-    return (block.get("data") or {}).get("name") not in _OWN_UNITS
-
-
-def in_unit(columns: Iterable[Column], names: Collection[str]) -> list[Column]:
-    """Titles of lengths as they are for data sets of these names: in centimetres, or in the truth's own unit."""
-    own = [name in _OWN_UNITS for name in names]
-    unit = ".01 units" if all(own) else "cm or .01 units"
-    return [c._replace(title=c.title.replace("[cm]", f"[{unit}]")) if any(own) else c for c in columns]
+    return (block.get("data") or {}).get("name") not in OWN_UNITS
 
 
 def length_words(length: float, block: Mapping[str, Any]) -> str:
@@ -150,20 +138,16 @@ def _rank(key: str) -> tuple[int, int]:
 
 
 def _version(names: tuple[str, ...]) -> str | None:
+    """The version of the first of these packages that is installed."""
     for name in names:
-        try:
+        with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             return importlib.metadata.version(name)
-        except importlib.metadata.PackageNotFoundError:
-            continue
     return None
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
+    command, how = ["git", "-C", str(folder), *arguments], {"encoding": "utf-8", "errors": "replace", "timeout": 10}
     try:
-        command = ["git", "-C", str(folder), *arguments]
-        answer = subprocess.run(
-            command, capture_output=True, encoding="utf-8", errors="replace", timeout=10, check=False
-        )
-    except (OSError, subprocess.TimeoutExpired):
+        return subprocess.run(command, capture_output=True, check=True, **how).stdout.strip()
+    except (OSError, subprocess.SubprocessError):
         return None
-    return answer.stdout.strip() if answer.returncode == 0 else None

@@ -37,14 +37,10 @@ _relevance = eqx.filter_jit(relevance)
 
 @dataclass(frozen=True)
 class Question:
-    """Query to a map.
-
-    Args:
-        against: rivals, which are not asked for, in the same space; may be empty.
-    """
+    """Query to a map."""
 
     words: TextEmbeddings
-    against: TextEmbeddings
+    against: TextEmbeddings  # rivals, which are not asked for, in the same space; may be empty
     margin: float
     min_cosine: float
     instances: InstanceConfig
@@ -52,20 +48,14 @@ class Question:
 
 @dataclass(frozen=True)
 class Answer:
-    """Result of a query to a map.
-
-    Args:
-        gaussians: the confirmed ones are valid; on the device.
-        relevance: of all rows of the map, on the host.
-        reach: distance within which answers are one object, in the unit of the map.
-    """
+    """Result of a query to a map."""
 
     question: Question
-    gaussians: Gaussians
-    relevance: Relevance
-    rows: np.ndarray
-    instances: list[list[Instance]]
-    reach: float
+    gaussians: Gaussians  # the confirmed ones are valid; on the device
+    relevance: Relevance  # of all rows of the map, on the host
+    rows: np.ndarray  # of the confirmed ones
+    instances: list[list[Instance]]  # of each word
+    reach: float  # distance within which answers are one object, in the unit of the map
 
 
 def ask(run: FinishedRun, question: Question) -> Answer:
@@ -77,16 +67,10 @@ def ask(run: FinishedRun, question: Question) -> Answer:
     rows = np.flatnonzero(gaussians.valid)
     means, covs = np.asarray(gaussians.means), np.asarray(gaussians.covs)
     reach = reach_of(means[rows].astype(np.float64), question.instances)
-    instances = [
-        find_instances(
-            np.flatnonzero(found.labels == word),
-            (means, covs),
-            (found.cosines[:, word], found.leads[:, word]),
-            reach,
-            question.instances.min_gaussians,
-        )
-        for word in range(len(question.words.names))
-    ]
+    instances = []
+    for word in range(len(question.words.names)):
+        answers, strength = np.flatnonzero(found.labels == word), (found.cosines[:, word], found.leads[:, word])
+        instances.append(find_instances(answers, (means, covs), strength, reach, question.instances.min_gaussians))
     return Answer(question, gaussians, found, rows, instances, reach)
 
 

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -20,7 +19,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import write_file
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
-from emgs_jax.report.colors import class_colors, save_figure
+from emgs_jax.report.colors import class_colors, save_figure, save_png
 from emgs_jax.report.finished_run import FinishedRun, render_config
 from emgs_jax.report.query import GREY, Answer, heat, hot, painted
 from emgs_jax.semantics import principal_colors
@@ -76,21 +75,15 @@ def best_views(run: FinishedRun, answer: Answer, count: int) -> list[list[View]]
     camera = downscale(run.camera, -(-run.camera.width // SMALL_WIDTH))
     words = len(answer.question.words.names)
     answers = answer.relevance.labels[:, None] == np.arange(words)
-    views = views_of(run)
-    shown = [
-        np.nansum(drawn(run, answer.gaussians, answers.astype(np.float32), view, camera), axis=(0, 1)) for view in views
-    ]
-    scores = np.array(shown).reshape(len(views), words)
+    views, scores = views_of(run), np.zeros((MAX_POSES, words))
+    for row, view in enumerate(views):
+        scores[row] = np.nansum(drawn(run, answer.gaussians, answers.astype(np.float32), view, camera), axis=(0, 1))
     order = np.argsort(-scores, axis=0, kind="stable")
     return [[views[row] for row in order[:count, word] if scores[row, word] > 0] for word in range(words)]
 
 
 def draw_answer(path: Path, run: FinishedRun, answer: Answer, views: Sequence[Sequence[View]], max_words: int) -> int:
-    """Draw a line for each word and view: the map in its colours, the word's relevance, the classes with a legend.
-
-    Returns:
-        How many words are drawn.
-    """
+    """Draw a line for each word and view: the map, the word's relevance, the classes; returns how many words."""
     names, has_classes = answer.question.words.names, len(views) > 1
     counts = [(answer.relevance.labels == word).sum() for word in range(len(views))]
     words = sorted(map(int, np.argsort(-np.array(counts), kind="stable")[:max_words]))
@@ -114,8 +107,7 @@ def save_labels(folder: Path, run: FinishedRun, answer: Answer, views: Mapping[s
     folder.mkdir(parents=True, exist_ok=True)
     names = answer.question.words.names
     for name, view in views.items():
-        labels = label_image(run, answer, view)
-        write_file(folder / f"{name}.png", cv2.imencode(".png", labels.astype(np.uint16))[1].tobytes())
+        save_png(folder / f"{name}.png", label_image(run, answer, view).astype(np.uint16))
     write_file(folder / CLASSES_FILE, "".join(f"{number} {name}\n" for number, name in enumerate(names, start=1)))
 
 

@@ -18,15 +18,10 @@ _LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # of C where it is ther
 
 
 class Repeated(NamedTuple):
-    """Overrides of `emgs run` that repeat a run.
+    """Overrides of `emgs run` that repeat a run."""
 
-    Args:
-        words: overrides of `emgs run` that compose its config, groups first; a key that conf/ no longer has has a +.
-        differences: key, value and default of each of them; a default that is not there is ...
-    """
-
-    words: list[str]
-    differences: list[tuple[str, Any, Any]]
+    words: list[str]  # that compose its config, groups first; a key that conf/ no longer has has a +
+    differences: list[tuple[str, Any, Any]]  # key, value and default of each; a default that is not there is ...
 
     @property
     def command(self) -> str:
@@ -36,14 +31,16 @@ class Repeated(NamedTuple):
 
 def repeat(settings: Mapping[str, Any]) -> Repeated:
     """Find the overrides that repeat the run with these settings, the `config` of a provenance."""
-    settings, options = flat(jsonable(settings)), _options(settings)
+    settings = flat(jsonable(settings))
+    options = _options(settings)
     words = [f"{group}={option}" for group, option, _ in options]
     differences: list[tuple[str, Any, Any]] = list(options)
     config, made = compose(*words), len(words)
     for follows_another in (False, True):  # what is taken from another key follows that one
         if len(words) > made:
             config = compose(*words)
-        composed, own = _values(config), flat(OmegaConf.to_container(config, resolve=False))
+        composed = flat(jsonable(OmegaConf.to_container(config, resolve=True)))
+        own = flat(OmegaConf.to_container(config, resolve=False))
         for key, value in settings.items():
             default = composed.get(key, ...)
             if default != value and (follows_another or not str(own.get(key, "${")).startswith("${")):
@@ -69,16 +66,13 @@ def _infinity(config: DictConfig, key: str) -> float | None:
     return next((end for end in (*given, field.range.high, field.range.low) if math.isinf(end)), None)
 
 
-def _values(config: DictConfig) -> dict[str, Any]:
-    return flat(jsonable(OmegaConf.to_container(config, resolve=True)))
-
-
 def _options(settings: Mapping[str, Any]) -> list[tuple[str, str, str]]:
-    """List group, option and default of every group with an option nearer than the default; reads files alone."""
+    """List group, option and default of every group with an option nearer to the flat settings than the default."""
     found = []
     for group, default in _default_options().items():
-        wanted = flat(_at(settings, group.split("/")))
-        options = {path.stem: _content(path) for path in sorted((CONF / group).glob("*.yaml"))}
+        start = f"{group.replace('/', '.')}."
+        wanted = {key.removeprefix(start): value for key, value in settings.items() if key.startswith(start)}
+        options = {path.stem: jsonable(_content(path)) for path in sorted((CONF / group).glob("*.yaml"))}
         gaps = {
             name: sum(made.get(k, ...) != wanted.get(k, ...) for k in {*made, *wanted})
             for name, made in options.items()
@@ -96,12 +90,6 @@ def _default_options() -> dict[str, str]:
     return {group: option for group, option in named.items() if option and (CONF / group).is_dir()}
 
 
-def _at(tree: Mapping[str, Any], path: list[str]) -> Mapping[str, Any]:
-    for name in path:
-        tree = tree.get(name) if isinstance(tree, Mapping) else None
-    return tree if isinstance(tree, Mapping) else {}
-
-
 def _content(path: Path) -> dict[str, Any]:
     """Read values by dotted key of a file of conf/, with those that it inherits from others beside it."""
     node = _read(path)
@@ -116,11 +104,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def check_targets(settings: Any) -> None:
     """Raise ValueError where settings name a class that conf/ does not: a file from elsewhere must not choose code."""
-    known = {
-        value for path in CONF.rglob("*.yaml") for key, value in flat(_read(path)).items() if key.endswith("_target_")
-    }
-    named = {value for key, value in flat({"": settings}).items() if key.endswith("_target_")}
-    if named - known:
-        raise ValueError(
-            f"metrics.json names {sorted(map(str, named - known))}, which no file of conf/ does: run again"
-        )
+    trees = [{"": settings}, *map(_read, CONF.rglob("*.yaml"))]
+    named, *known = ({v for key, v in flat(tree).items() if key.endswith("_target_")} for tree in trees)
+    if unknown := named.difference(*known):
+        raise ValueError(f"metrics.json names {sorted(map(str, unknown))}, which no file of conf/ does: run again")

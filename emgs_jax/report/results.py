@@ -2,10 +2,13 @@
 
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+import yaml
 
 from emgs_jax.io.files import changes, jsonable
 from emgs_jax.report.provenance import RESULT_FORMAT, ROWS, prefix_of
@@ -14,35 +17,34 @@ METRICS_FILE = "metrics.json"
 _PLACES = ("dataset.root", "compilation_cache", "checksums")  # say where things are, not what is computed
 
 
+@contextmanager
+def sound(what: str, remedy: str = "run again") -> Iterator[None]:
+    """Raise one ValueError for whatever is wrong with the content of a file that is read inside of the `with`."""
+    try:
+        yield
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError) as error:
+        raise ValueError(f"{what} ({error!r}): {remedy}") from error
+
+
 @dataclass(frozen=True)
 class Estimate:
-    """Estimate of one run that was compared with the truth: the map, the raw predictions, or a baseline.
-
-    Args:
-        kind: "ours", "raw prior", another one of `ROWS`, or "scored" for another system.
-        prior: its name; None for another system.
-        revision: of the code; None where unknown.
-    """
+    """Estimate of one run that was compared with the truth: the map, the raw predictions, or a baseline."""
 
     folder: Path
     dataset: str
     sequence: str
     variant: str
-    kind: str
+    kind: str  # "ours", "raw prior", another one of `ROWS`, or "scored" for another system
     seed: int
-    prior: str | None
+    prior: str | None  # its name; None for another system
     is_simulated: bool
     protocol: str
-    revision: str | None
+    revision: str | None  # of the code; None where unknown
     values: dict[str, float]
 
 
 def result_folder(out: Path, dataset: str, sequence: str, variant: str, seed: int) -> Path:
-    """Return the folder of one result; each part is one level.
-
-    Raises:
-        ValueError: a part is no name of one level, so that the folder would be elsewhere.
-    """
+    """Return the folder of one result; ValueError where a part is no name of one level, and it would be elsewhere."""
     parts = {"dataset": dataset, "sequence": str(sequence).replace("/", "_"), "variant or method": variant}
     for what, part in parts.items():
         if not re.fullmatch(r"[^/\\\0]+", part) or part in (".", ".."):
@@ -52,11 +54,9 @@ def result_folder(out: Path, dataset: str, sequence: str, variant: str, seed: in
 
 def read_metrics(path: Path, remedy: str = "move its folder away or choose another out=FOLDER") -> dict[str, Any]:
     """Read a metrics.json of this version; any other raises ValueError, which says the remedy."""
-    try:
+    with sound(f"{path} is not the result of a run", remedy):
         metrics = json.loads(path.read_text(encoding="utf-8"))
         found = metrics["provenance"].get("format")
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
-        raise ValueError(f"{path} is not the result of a run ({error!r}): {remedy}") from error
     if found != RESULT_FORMAT:
         raise ValueError(f"{path} was written by another version (format {found}, not {RESULT_FORMAT}): {remedy}")
     return metrics
@@ -85,13 +85,12 @@ def read_estimates(out: Path) -> list[Estimate]:
 def estimates_of(path: Path) -> list[Estimate]:
     """Read the estimates of one result: ours, the raw prior and baselines, or another system."""
     metrics = read_metrics(path)
-    block, folder, there = metrics["provenance"], path.parent, {"", *map(prefix_of, metrics)}
+    block, folder, found = metrics["provenance"], path.parent, {"": {}}
+    for key, value in metrics.items():
+        values = found.setdefault(prefix := prefix_of(key), {})
+        if isinstance(value, int | float):
+            values[key.removeprefix(prefix)] = value
     kinds = ROWS | {"": "ours" if block["prior"] else "scored"}
-
-    def numbers(prefix: str) -> dict[str, float]:
-        own = {key: value for key, value in metrics.items() if prefix_of(key) == prefix}
-        return {key.removeprefix(prefix): value for key, value in own.items() if isinstance(value, int | float)}
-
     return [
         Estimate(
             folder=folder,
@@ -104,8 +103,8 @@ def estimates_of(path: Path) -> list[Estimate]:
             is_simulated=block["simulated"],
             protocol=block["protocol"],
             revision=(block["git"] or {}).get("revision"),
-            values=numbers(prefix),
+            values=found[prefix],
         )
         for prefix, kind in kinds.items()
-        if prefix in there
+        if prefix in found
     ]

@@ -2,6 +2,8 @@
 
 import itertools
 import json
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import jax
@@ -9,11 +11,9 @@ import numpy as np
 
 from emgs_jax.back_end.g2o import save_graph_g2o
 from emgs_jax.back_end.saved_map import save_places
-from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.features.text import TextEmbeddings, save_text
-from emgs_jax.gaussian_map import confirmed
-from emgs_jax.gaussians import Gaussians
+from emgs_jax.gaussian_map import GaussianMap, confirmed
 from emgs_jax.geometry import seen_from
 from emgs_jax.io.files import atomic_write, remove_temporaries, write_json
 from emgs_jax.io.map_file import save_map
@@ -22,16 +22,14 @@ from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.trajectory import from_tum, save_trajectory_tum
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE
 from emgs_jax.mapping.event import NEW_SUBMAP
-from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, records_apart
+from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, FrameRecord, records_apart
 from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import loop_list, metric_graph
 from emgs_jax.report.dense import DenseMap, center_cloud
-from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.finished_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, POLISH, REPORT_FILE, TEXT_FILE
-from emgs_jax.report.layers import feature_colors
-from emgs_jax.slam import SlamState
+from emgs_jax.report.layers import closing_covariances, feature_colors
 
 # metrics.json first: it is what makes a folder a finished result.
 OUTPUTS = (
@@ -68,12 +66,11 @@ def save_progress(folder: Path, run: MappingRun) -> None:
     """
     _complete_lines(folder / FRAMES_FILE, run)
     if run.state is not None:
-        save_trajectory_tum(
-            folder / "trajectory.txt", [record.timestamp for record in run.records], np.stack(run.poses)
-        )
-        save_map(folder / "map.npz", run.state.map)
-    for number, state in run.apart.items():
-        _save_submap(folder / "submaps" / str(number), number, state, run)
+        _save_path_and_map(folder, run.records, run.poses, run.state.map)
+    for number, state in run.apart.items():  # in its own world and unit
+        submap, records = folder / "submaps" / str(number), records_apart(run.records, number)
+        submap.mkdir(parents=True, exist_ok=True)
+        _save_path_and_map(submap, records, [record.pose for record in records], state.map)
     end = run.back_end
     if end is not None and end.database.keyframes and run.state is not None:
         save_places(folder / "places.npz", end, float(run.state.estimate.depth_noise))
@@ -86,14 +83,9 @@ def save_progress(folder: Path, run: MappingRun) -> None:
             save_graph_g2o(folder / "graph.g2o", metric_graph(end))
 
 
-def _save_submap(folder: Path, number: int, state: SlamState, run: MappingRun) -> None:
-    """Write map and path of a submap that was never joined, in its own world and unit."""
-    folder.mkdir(parents=True, exist_ok=True)
-    records = records_apart(run.records, number)
-    save_trajectory_tum(
-        folder / "trajectory.txt", [record.timestamp for record in records], np.stack([r.pose for r in records])
-    )
-    save_map(folder / "map.npz", state.map)
+def _save_path_and_map(folder: Path, records: Sequence[FrameRecord], poses: Sequence[np.ndarray], map: GaussianMap):
+    save_trajectory_tum(folder / "trajectory.txt", [record.timestamp for record in records], np.stack(poses))
+    save_map(folder / "map.npz", map)
 
 
 def _complete_lines(path: Path, run: MappingRun) -> None:
@@ -102,9 +94,7 @@ def _complete_lines(path: Path, run: MappingRun) -> None:
         return
     lines, records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()], iter(run.records)
     uncertain = [line for line in lines if line["covariance"] is not None]
-    has_one_world = all(
-        record.location != NEW_SUBMAP for record in run.records
-    )  # poses as placed, that of the first, too
+    has_one_world = all(record.location != NEW_SUBMAP for record in run.records)  # poses as placed, of the first, too
     if run.first_covariance is not None and uncertain and has_one_world:
         first = next(line["pose"] for line in lines if line["pose"] is not None)
         placed = from_tum(np.array([first, *(line["pose"] for line in uncertain)]))
@@ -160,18 +150,12 @@ def save_outputs(
     no_mesh = save_mesh_ply(folder / "mesh.ply", centers.points, centers.normals, colored)
     is_placed = np.array([record.status not in UNPLACED for record in run.records])
     paths = Paths(np.stack(run.poses), is_placed, _placed_truth(run, with_scale), *_moved(run), unit=unit)
+    features = None  # the centres in the colours of their features
+    if gaussians.features[valid].any():
+        features = replace(centers, colors=np.asarray(feature_colors(shown))[valid])
     classes = () if dense.labels is None else dense.labels.classes
-    draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes, feature_cloud(shown))
+    draw_overview(folder / "overview.png", dense.cloud, paths, dense.pictures, title, classes, features)
     return [] if no_mesh is None else [f"no mesh.ply: {no_mesh}"]
-
-
-def feature_cloud(gaussians: Gaussians) -> PointCloud | None:
-    """The means of those that are valid, in the colours of their features; None where none has any."""
-    valid = np.asarray(gaussians.valid)
-    if not np.asarray(gaussians.features)[valid].any():
-        return None
-    colors = np.asarray(feature_colors(gaussians))
-    return PointCloud(*(np.asarray(values)[valid] for values in (gaussians.means, gaussians.normals, colors)))
 
 
 def _placed_truth(run: MappingRun, with_scale: bool) -> np.ndarray | None:

@@ -31,15 +31,7 @@ def images_of(run: FinishedRun) -> tuple[ReadableFrames | None, str]:
 
 
 class ImagesOfRuns(JoinedFrames):
-    """The images of several runs, one after the other: the data set of a merged run.
-
-    Args:
-        runs: their folders.
-        has_truth: see `JoinedFrames`.
-
-    Raises:
-        ValueError: those of a run are gone.
-    """
+    """The images of the runs in some folders, one after the other; ValueError where those of a run are gone."""
 
     def __init__(self, runs: Sequence[str], has_truth: bool = True) -> None:
         found = [images_of(read_run(Path(folder))) for folder in runs]

@@ -4,7 +4,6 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, TypeAlias
 
-import cv2
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -30,6 +29,7 @@ from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, gaussians_of, relative_gain, ssim
 from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
+from emgs_jax.report.colors import save_png, to_bytes
 from emgs_jax.report.finished_run import POLISH, SPLATS_FILE, FinishedRun
 from emgs_jax.report.splats import owners
 from emgs_jax.semantics import classify
@@ -48,15 +48,12 @@ def polish(
 ) -> dict[str, Any]:
     """Fit splats to all placed frames but the held-out ones; write them, and how the held-out ones look before, after.
 
+    Returns what polish.json says. ValueError where the map is empty, there is no frame to fit or to compare with, or
+    optax is not installed.
+
     Args:
         run: whose folder is written into.
         densify_config: how the run drew its map.
-
-    Returns:
-        What polish.json says.
-
-    Raises:
-        ValueError: the map is empty, there is no frame to fit or to compare with, or optax is not installed.
     """
     extra(*OPTAX)
     gaussians = confirmed(run.map)
@@ -227,7 +224,5 @@ def _compare(
             if key.startswith("rendering/depth"):
                 metrics[f"polish/{name}_{key.removeprefix('rendering/')}"] = value
     shown = [strips[int(row)] for row in np.unique(np.linspace(0, len(strips) - 1, MAX_PICTURES).astype(int))]
-    pixels = np.rint(255 * np.concatenate(shown)).astype(np.uint8)
-    if not cv2.imwrite(str(run.folder / PICTURE_FILE), cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)):
-        raise OSError(f"{run.folder / PICTURE_FILE} cannot be written: is the disk full?")
+    save_png(run.folder / PICTURE_FILE, to_bytes(np.concatenate(shown)))
     return metrics

@@ -15,12 +15,12 @@ from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.geometry import Sim3
-from emgs_jax.report.columns import DASH, Table, cell, markdown
+from emgs_jax.report.columns import DASH, MAIN, Table, cell, in_unit, markdown
 from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.semantics import similarities
 
 FORMAT, VERSION = "emgs_jax.segmentation", 1
-_TITLES = ("method", "source", "protocol", "scenes", "placed by", "mIoU [%]", "f-mIoU [%]", "Acc [%]", "ATE [cm]")
+_TITLES = ("method", "source", "protocol", "scenes", "placed by", "mIoU [%]", "f-mIoU [%]", "Acc [%]")
 _NOTES = """
 Acc is the mean recall of the classes under ovo and conceptgraphs, the share of the points under rayfronts. Quoted rows
 are not measured here: they are of eight scenes of Replica. **simulated**: the prior is disturbed ground truth, which
@@ -30,47 +30,31 @@ says nothing about a network and must not be compared with quoted rows; neither 
 
 @dataclass(frozen=True)
 class Placement:
-    """Alignment of a map with the truth.
-
-    Args:
-        by: `trajectory`, the alignment of the poses; or `points`, from there a rigid ICP of the centres onto the truth.
-        with_scale: the alignment of the poses estimates a scale, too.
-        icp_distance_m: pairs of ICP are nearer than this.
-    """
+    """Alignment of a map with the truth: by the `trajectory`, or from there by a rigid ICP of the `points`."""
 
     by: str
-    with_scale: bool
-    icp_distance_m: float
+    with_scale: bool  # the alignment of the poses estimates a scale, too
+    icp_distance_m: float  # pairs of ICP are nearer than this
     icp_max_steps: int
 
 
 @dataclass(frozen=True)
 class SceneResult:
-    """One map against the truth of its scene.
-
-    Args:
-        confusion: see `scene_confusion`.
-    """
+    """One map against the truth of its scene."""
 
     scene: str
     folder: str
     is_simulated: bool
-    confusion: np.ndarray
+    confusion: np.ndarray  # see `scene_confusion`
     about: dict[str, Any]
     ate_m: float | None
 
 
 def place(run: FinishedRun, truth: np.ndarray, how: Placement) -> tuple[np.ndarray, dict[str, Any]]:
-    """Move the confirmed Gaussians' centres (n, 3) to the frame of true points (m, 3); says how, too.
-
-    Raises:
-        ValueError: no true pose is known.
-    """
+    """Move the confirmed Gaussians' centres (n, 3) to true points (m, 3); says how. ValueError without true poses."""
     known = run.has_truth
     if not known.any():
-        raise ValueError(
-            f"{run.folder}/frames.jsonl has no true pose to place the map by: map a data set with ground truth"
-        )
+        raise ValueError(f"{run.folder}/frames.jsonl has no true pose to place the map by: map a data set with truth")
     alignment, note = align_poses(run.poses[known], run.truth[known], how.with_scale)
     gaussians = jax.device_get(confirmed(run.map))
     points = alignment.apply(gaussians.means[gaussians.valid].astype(np.float64))
@@ -105,6 +89,7 @@ def score_scene(
     distances = NearestPoints(points).query(truth.points)[0] if len(points) else np.array([np.inf])
     about |= {"num_gaussians": len(rows), "num_with_class": int((labels >= 0).sum())}
     about |= {"num_true_points": len(truth.points), "median_distance_to_map_m": float(np.median(distances))}
+    about["data"] = run.provenance["data"]["name"]
     is_simulated = bool(run.provenance.get("simulated", False))
     ate = run.metrics.get("trajectory/ate_sim3_m")
     return SceneResult(scene, str(run.folder), is_simulated, confusion, about, ate)
@@ -155,21 +140,20 @@ def table(found: Mapping[str, Any], published: Sequence[Mapping[str, Any]]) -> s
     """
     scenes = found["scenes"]
     over = "one matrix of" if found["protocol"]["scenes"] == "sum" else "mean of"
-    lines = [_line("ours", f"{over} {len(scenes)}", found["total"], found["simulated"], found)]
+    lines = [_line(f"{over} {len(scenes)}", found["total"], found["simulated"], found)]
     if len(scenes) > 1:
-        lines += [_line("ours", scene["scene"], scene, scene["simulated"], found) for scene in scenes]
+        lines += [_line(scene["scene"], scene, scene["simulated"], found) for scene in scenes]
     for row in published:
         cells = [DASH if value is None else f"{value:g}" for value in row["values"]]
         lines.append([row["method"], f"quoted: {row['source']}", row["protocol"], "8 of Replica", DASH, *cells])
-    return markdown(Table(_TITLES, lines)) + _NOTES
+    (ate,) = in_unit(MAIN[:1], {scene["data"] for scene in scenes})
+    return markdown(Table([*_TITLES, ate.title], lines)) + _NOTES
 
 
-def _line(
-    method: str, scenes: str, values: Mapping[str, Any], is_simulated: bool, found: Mapping[str, Any]
-) -> list[str]:
+def _line(scenes: str, values: Mapping[str, Any], is_simulated: bool, found: Mapping[str, Any]) -> list[str]:
     cells = [cell(values[name], None, 1.0, 1) for name in NAMES] + [cell(values["ate_sim3_m"], None, 100.0, 1)]
     source = "**simulated**" if is_simulated else "measured"
-    return [method, source, found["protocol"]["name"], scenes, found["placement"]["by"], *cells]
+    return ["ours", source, found["protocol"]["name"], scenes, found["placement"]["by"], *cells]
 
 
 def _plain(alignment: Sim3) -> dict[str, Any]:

@@ -16,27 +16,16 @@ _STEPS = 65535  # of a coordinate along the side of the box round all splats
 
 
 class Splats(NamedTuple):
-    """Splats in the map's frame and lengths.
+    """Splats in the map's frame and lengths."""
 
-    Args:
-        means: (n, 3).
-        covs: (n, 3, 3).
-        normals: (n, 3), towards the side that they were seen from.
-        colors: (n, 4), RGB and the opacity at the centre, in [0, 1].
-    """
-
-    means: np.ndarray
-    covs: np.ndarray
-    normals: np.ndarray
-    colors: np.ndarray
+    means: np.ndarray  # (n, 3)
+    covs: np.ndarray  # (n, 3, 3)
+    normals: np.ndarray  # (n, 3), towards the side that they were seen from
+    colors: np.ndarray  # (n, 4), RGB and the opacity at the centre, in [0, 1]
 
 
 def read_splats(path: Path) -> Splats | None:
-    """Read a 3DGS PLY; None where there is no file.
-
-    Raises:
-        ValueError: the file is no such PLY.
-    """
+    """Read a 3DGS PLY; None where there is no file, ValueError where it is no such PLY."""
     if not path.is_file():
         return None
     vertices = read_vertices(path)
@@ -62,11 +51,7 @@ def read_splats(path: Path) -> Splats | None:
 
 
 def owners(splats: np.ndarray, gaussians: np.ndarray) -> np.ndarray:
-    """Find for each splat's mean (n, 3) the row of the nearest Gaussian's (m, 3): of its class, feature and certainty.
-
-    Raises:
-        ValueError: there are splats and no Gaussian.
-    """
+    """Find for each splat's mean (n, 3) the row of the nearest Gaussian's (m, 3), whose class and certainty it has."""
     if len(splats) and not len(gaussians):
         raise ValueError("the map has no Gaussian that splats could belong to: run emgs polish again")
     return NearestPoints(gaussians).query(splats)[1].reshape(len(splats)).astype(np.int32)

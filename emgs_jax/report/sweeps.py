@@ -1,4 +1,4 @@
-"""The files of a sweep: sweep.json after every chunk, from which it is resumed; and its table."""
+"""The files of a sweep: sweep.json after every chunk, from which it is resumed, and the places of its pictures."""
 
 import hashlib
 import json
@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from emgs_jax.io.files import changes, jsonable, write_json
-from emgs_jax.report.columns import MAIN, Line, known, markdown, metric_table
+from emgs_jax.report.results import sound
 
 FORMAT, VERSION = "emgs_jax.running.stacked", 1
 _REMEDY = "make it again in another folder (hydra.run.dir=…), or move this one away"
@@ -15,10 +15,8 @@ _REMEDY = "make it again in another folder (hydra.run.dir=…), or move this one
 
 def read_sweep(path: Path) -> dict[str, Any]:
     """Read a sweep.json of this version; any other raises ValueError."""
-    try:
+    with sound(f"{path} is damaged", _REMEDY):
         sweep = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged ({error}): {_REMEDY}") from error
     if not isinstance(sweep, dict) or (sweep.get("format"), sweep.get("version")) != (FORMAT, VERSION):
         raise ValueError(f"{path} is not a sweep of version {VERSION}: {_REMEDY}")
     return sweep
@@ -64,9 +62,3 @@ def _key(setting: Mapping[str, Any]) -> str:
 def picture_path(folder: Path, setting: Mapping[str, Any]) -> Path:
     """Return the path of a setting's picture; its name follows from the values."""
     return folder / "pictures" / f"{hashlib.sha256(_key(setting).encode()).hexdigest()[:16]}.jpg"
-
-
-def table(rows: Sequence[Mapping[str, Any]], axes: Sequence[str]) -> str:
-    """Write the values and main metrics of every row in Markdown; the best of a column is bold."""
-    lines = [Line([str(row[name]) for name in axes], row) for row in rows]
-    return markdown(metric_table(axes, known(MAIN, lines), lines))

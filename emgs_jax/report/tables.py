@@ -19,7 +19,6 @@ from emgs_jax.report.columns import (
     markdown,
     metric_table,
 )
-from emgs_jax.report.provenance import in_unit
 from emgs_jax.report.results import Estimate
 
 _PAPER_DATASETS = {"seven_scenes": "7-Scenes", "tum": "TUM"}
@@ -50,14 +49,7 @@ over seq-01 of seven scenes (7-Scenes) and nine sequences of freiburg1 (TUM).
 
 @dataclass(frozen=True)
 class Row:
-    """Mean and spread over the seeds of one kind of estimate.
-
-    Args:
-        sequences: over which each seed's value is the mean.
-        seeds: that have a result for each of the sequences.
-        values: metric -> mean over the seeds, None where one has none.
-        spreads: metric -> standard deviation over the seeds, None for fewer than two.
-    """
+    """Mean and spread over the seeds of one kind of estimate."""
 
     dataset: str
     variant: str
@@ -65,10 +57,10 @@ class Row:
     prior: str | None
     is_simulated: bool
     protocol: str
-    sequences: tuple[str, ...]
-    seeds: tuple[int, ...]
-    values: dict[str, float | None]
-    spreads: dict[str, float | None]
+    sequences: tuple[str, ...]  # over which each seed's value is the mean
+    seeds: tuple[int, ...]  # that have a result for each of the sequences
+    values: dict[str, float | None]  # metric -> mean over the seeds, None where one has none
+    spreads: dict[str, float | None]  # metric -> standard deviation over the seeds, None for fewer than two
 
 
 def average(estimates: Iterable[Estimate], each_sequence: bool) -> list[Row]:
@@ -92,9 +84,7 @@ def to_csv(estimates: Sequence[Estimate]) -> str:
 def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> str:
     """Write rows over all sequences like the paper's Table II, in Markdown; empty if none is of its data sets.
 
-    Args:
-        rows: over all sequences.
-        published: quoted rows: method, source, protocol and the columns' values by data set.
+    Quoted rows are `published`: method, source, protocol and the columns' values by data set.
     """
     methods: dict[tuple, dict[str, Row]] = defaultdict(dict)
     for row in rows:
@@ -106,8 +96,7 @@ def paper_table(rows: Sequence[Row], published: Sequence[Mapping[str, Any]]) -> 
     for what, members in methods.items():
         found = [(name, members[key]) for key, name in _PAPER_DATASETS.items() if key in members]
         runs = "; ".join(f"{name} {len(row.sequences)} × {len(row.seeds)}" for name, row in found)
-        cells = [text for key in _PAPER_DATASETS for text in _paper_cells(members.get(key))]
-        lines.append([*what, runs, *cells])
+        lines.append([*what, runs, *(text for key in _PAPER_DATASETS for text in _paper_cells(members.get(key)))])
     for row in published:
         cells = [DASH if value is None else f"{value:g}" for key in _PAPER_DATASETS for value in row[key]]
         lines.append([row["method"], f"quoted: {row['source']}", row["protocol"], DASH, *cells])
@@ -122,8 +111,8 @@ def full_table(rows: Sequence[Row]) -> str:
         method = f"{row.kind}, {row.variant}"
         labels = [row.dataset, over(row.sequences), method, source_of(row), row.protocol, str(len(row.seeds))]
         lines.append(Line(labels, row.values, row.spreads, rivals=None))
-    columns = in_unit(COLUMNS, {row.dataset for row in rows})
-    return markdown(metric_table(["data set", "sequence", "method", "source", "protocol", "seeds"], columns, lines))
+    titles = ["data set", "sequence", "method", "source", "protocol", "seeds"]
+    return markdown(metric_table(titles, COLUMNS, lines, {row.dataset for row in rows}))
 
 
 def over(sequences: Sequence[str]) -> str:

@@ -2,7 +2,7 @@
 
 import os
 import statistics
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from typing import Any
@@ -11,7 +11,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from emgs_jax.report.colors import save_figure
-from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, Line, markdown, metric_table
+from emgs_jax.report.columns import MAIN, PLACED, RENDERED, Column, Line, in_unit, markdown, metric_table
 from emgs_jax.report.provenance import RAW_PRIOR
 
 DEFAULT, RAW = "default", "raw prior"
@@ -19,16 +19,13 @@ DEFAULT, RAW = "default", "raw prior"
 
 @dataclass(frozen=True)
 class SequenceResults:
-    """Metrics of the settings of a search on one sequence.
-
-    Args:
-        metrics: of DEFAULT and of trials, by name.
-    """
+    """Metrics of the settings of a search on one sequence."""
 
     name: str
+    data: str  # name of its data set
     is_held_out: bool
     is_simulated: bool
-    metrics: Mapping[str, Mapping[str, Any]]
+    metrics: Mapping[str, Mapping[str, Any]]  # of DEFAULT and of trials, by name
 
 
 def columns_of(objectives: Mapping[str, str]) -> list[Column]:
@@ -53,7 +50,7 @@ def table(results: Sequence[SequenceResults], objectives: Mapping[str, str]) -> 
             for setting, values in rows.items():
                 rivals = None if setting == RAW else (kind, name)
                 lines.append(Line([kind, name, setting], values, rivals=rivals))
-    return markdown(metric_table(["", "sequence", "setting"], columns, lines))
+    return markdown(metric_table(["", "sequence", "setting"], columns, lines, {result.data for result in results}))
 
 
 Rows = Mapping[str, Mapping[str, Any]]  # metrics by setting
@@ -112,18 +109,19 @@ def draw_trials(
     objectives: Mapping[str, str],
     named: Mapping[int, str],
     title: str,
+    data: Collection[str],
 ) -> str | None:
     """Draw the first objective over the second, or over the trials where there is but one, and write it as PNG.
+
+    Returns None, or why there is no picture.
 
     Args:
         rows: of trials: `trial`, its number, and the objectives, which may be None.
         objectives: metric -> direction.
         named: words of the trials that are marked, by their number.
-
-    Returns:
-        None, or why there is no picture.
+        data: names of the data sets.
     """
-    shown = columns_of(objectives)[: min(len(objectives), 2)]
+    shown = in_unit(columns_of(objectives)[: min(len(objectives), 2)], data)
     known = [row for row in rows if all(row.get(column.key) is not None for column in shown)]
     if not known:
         return "no trial has all objectives"

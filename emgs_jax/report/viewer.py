@@ -39,11 +39,7 @@ def _alone(method: Callable) -> Callable:
 
 
 class Viewer:
-    """A run that is being served until `stop`.
-
-    Raises:
-        ValueError: the port is taken, or viser is not installed.
-    """
+    """A run that is being served until `stop`; ValueError where the port is taken, or viser is not installed."""
 
     def __init__(self, run: Shown, port: int) -> None:
         viser = extra("viser", "the viewer needs viser", "viewer")

@@ -18,15 +18,10 @@ Layers = Mapping[str, np.ndarray]  # as `layers.map_layers` makes them, perhaps 
 
 
 class Answer(NamedTuple):
-    """Result of a query for words in a map.
+    """Result of a query for words in a map."""
 
-    Args:
-        cosines: of each Gaussian with the closest word that is asked for, (n,) in [0, 1].
-        is_found: (n,) closer to it than to all rivals, and close enough.
-    """
-
-    cosines: np.ndarray
-    is_found: np.ndarray
+    cosines: np.ndarray  # of each Gaussian with the closest word that is asked for, (n,) in [0, 1]
+    is_found: np.ndarray  # (n,), closer to it than to all rivals, and close enough
 
 
 def find_words(text: str, names: Sequence[str]) -> tuple[list[int], int]:
@@ -45,22 +40,16 @@ def find_words(text: str, names: Sequence[str]) -> tuple[list[int], int]:
 
 
 def ask(layers: Layers, wanted: Sequence[int], against: Sequence[int], min_cosine: float) -> Answer:
-    """Look for words in a map, as `semantics.answers` does without a margin.
+    """Look for words in a map with classes, as `semantics.answers` does without a margin.
 
-    Args:
-        layers: with classes.
-        wanted: rows of the words that are asked for, at least one.
-        against: rows of words that are not.
+    Rows of the words that are asked for, at least one, are `wanted`; those of rivals are `against`.
     """
     count = len(layers["label"])
     fill = (0, (1 << (count - 1).bit_length()) - count)  # few sizes, as each compiles once
     cosines = np.pad(layers["similarity"], (fill, (0, 0))).astype(np.float32) / 255.0
-    is_known = np.pad(layers["label"] >= 0, fill)
-    found = _answers(
-        *(jnp.asarray(cosines[:, [*rows]]) for rows in (wanted, against)),
-        jnp.asarray(is_known),
-        *(jnp.asarray(value, jnp.float32) for value in (0.0, min_cosine)),
-    )
+    words, rivals = (jnp.asarray(cosines[:, [*rows]]) for rows in (wanted, against))
+    is_known, limits = jnp.asarray(np.pad(layers["label"] >= 0, fill)), jnp.asarray([0.0, min_cosine], jnp.float32)
+    found = _answers(words, rivals, is_known, *limits)
     return Answer(cosines[:count, [*wanted]].max(axis=1), np.asarray(found.labels)[:count] >= 0)
 
 
@@ -73,8 +62,7 @@ def highlighted(colors: np.ndarray, answer: Answer) -> np.ndarray:
 def picked(means: np.ndarray, covs: np.ndarray, origin: Sequence[float], direction: Sequence[float]) -> int | None:
     """Find the Gaussian that a ray meets nearest to its centre on the first surface; None where there is none.
 
-    Args:
-        direction: of the ray; what lies behind the origin is not met.
+    What lies behind the origin is not met.
     """
     ray, offsets = np.asarray(direction, np.float64), np.asarray(means, np.float64) - np.asarray(origin, np.float64)
     if not len(means):

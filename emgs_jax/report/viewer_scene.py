@@ -22,28 +22,18 @@ KINDS = ("splats", "Gaussians", "points")  # as what a map is shown
 
 @dataclass(frozen=True)
 class Shown:
-    """A run as the viewer has it.
+    """A run as the viewer has it."""
 
-    Args:
-        layers: of the confirmed Gaussians, as `map_layers` and `feature_layer` make them; empty before there is a map.
-        names: of the classes; none without.
-        poses: T_world_camera of `frames`, (n, 4, 4).
-        truth: true camera centres in the frame of the map, (n, 3); nan where unknown.
-        image: of the last frame, uint8 (h, w, 3); None where nobody has it.
-        splats: of `emgs polish`; None where it was not run.
-        owners: of `splats`, rows of `layers`.
-    """
-
-    layers: Mapping[str, np.ndarray]
-    names: tuple[str, ...]
+    layers: Mapping[str, np.ndarray]  # as `map_layers` and `feature_layer` make them; empty before there is a map
+    names: tuple[str, ...]  # of the classes; none without
     frames: Sequence[Mapping[str, Any]]
-    poses: np.ndarray
-    truth: np.ndarray
+    poses: np.ndarray  # T_world_camera of `frames`, (n, 4, 4)
+    truth: np.ndarray  # true camera centres in the frame of the map, (n, 3); nan where unknown
     camera: Camera
     render: RenderConfig
-    image: np.ndarray | None = None
-    splats: Splats | None = None
-    owners: np.ndarray | None = None
+    image: np.ndarray | None = None  # of the last frame, uint8 (h, w, 3); None where nobody has it
+    splats: Splats | None = None  # of `emgs polish`; None where it was not run
+    owners: np.ndarray | None = None  # of `splats`, rows of `layers`
 
     @property
     def is_placed(self) -> np.ndarray:
@@ -66,7 +56,7 @@ class Scene:
 
     def __init__(self, server: Any) -> None:
         self._server, self._scene = server, server.scene
-        self.splats: Any = None
+        self.splats: Any = None  # the Gaussians, and their means as points
         self.points: Any = None
         self.sharp: Any = None  # the splats of `emgs polish`
         self.chosen: Any = None  # the frustum of one frame
@@ -76,8 +66,18 @@ class Scene:
 
     def draw(self, run: Shown, colors: np.ndarray) -> None:
         """Show a run that has frames, in the place of what stands there, with colours (n, 3) of its Gaussians."""
-        self.covs = covariances(run.layers)
-        self._draw_map(run, colors)
+        self.covs, means = covariances(run.layers), run.layers["mean"]
+        opacities = np.full((len(means), 1), float(run.render.opacity), np.float32)
+        if self.splats is not None:
+            self.splats.set_gaussians(means, self.covs, colors, opacities)
+        elif len(means):
+            self.splats = self._scene.add_gaussian_splats("/map", means, self.covs, colors, opacities)
+        if len(means):
+            self.points = self._scene.add_point_cloud("/points", means, colors, point_size=0.01, precision="float32")
+        if run.splats is not None and self.sharp is None:
+            places = (values.astype(np.float32) for values in (run.splats.means, run.splats.covs))
+            look = to_bytes(run.splats.colors[:, :3]), run.splats.colors[:, 3:].astype(np.float32)
+            self.sharp = self._scene.add_gaussian_splats("/splats", *places, *look)
         self.paths = [
             self._path("/our path", run.poses[:, :3, 3], run.is_placed, OURS),
             self._path("/true path", run.truth, np.isfinite(run.truth).all(1), PATHS["truth"].paper),
@@ -111,21 +111,6 @@ class Scene:
         _place(self.chosen, pose)
         self.chosen.image = image
 
-    def _draw_map(self, run: Shown, colors: np.ndarray) -> None:
-        means = run.layers["mean"]
-        if not len(means):
-            return
-        opacities = np.full((len(means), 1), float(run.render.opacity), np.float32)
-        if self.splats is None:
-            self.splats = self._scene.add_gaussian_splats("/map", means, self.covs, colors, opacities)
-        else:
-            self.splats.set_gaussians(means, self.covs, colors, opacities)
-        if run.splats is not None and self.sharp is None:
-            places = (values.astype(np.float32) for values in (run.splats.means, run.splats.covs))
-            look = to_bytes(run.splats.colors[:, :3]), run.splats.colors[:, 3:].astype(np.float32)
-            self.sharp = self._scene.add_gaussian_splats("/splats", *places, *look)
-        self.points = self._scene.add_point_cloud("/points", means, colors, point_size=0.01, precision="float32")
-
     def _draw_cameras(self, run: Shown) -> None:
         """Draw the cameras; those that stand there are moved, as a back end moves poses."""
         count = len(run.poses)
@@ -148,20 +133,20 @@ class Scene:
         return self._scene.add_line_segments(name, ends, _rgb(color), thickness=2.0, thickness_units="screen")
 
     def _frustum(self, run: Shown, name: str, row: int, color: str, scale: float) -> Any:
-        camera, pose = run.camera, run.poses[row]
         look = {"scale": scale, "thickness": 1.5, "thickness_units": "screen", "color": _rgb(color)}
-        place = {"wxyz": wxyz(pose), "position": pose[:3, 3]}
-        ratio = camera.width / camera.height
-        return self._scene.add_camera_frustum(name, field_of_view(camera), ratio, **look, **place)
+        ratio = run.camera.width / run.camera.height
+        frustum = self._scene.add_camera_frustum(name, field_of_view(run.camera), ratio, **look)
+        _place(frustum, run.poses[row])
+        return frustum
 
     def _place_views(self, pose: np.ndarray) -> None:
         """Look from a little behind the first camera, as it does."""
+        position, ahead, up = pose[:3, 3] - 0.3 * pose[:3, 2], pose[:3, 3] + pose[:3, 2], -pose[:3, 1]
         first = self._server.initial_camera
-        first.position = pose[:3, 3] - 0.3 * pose[:3, 2]
-        first.look_at, first.up = pose[:3, 3] + pose[:3, 2], -pose[:3, 1]
+        first.position, first.look_at, first.up = position, ahead, up
         for client in self._server.get_clients().values():  # who waits for the first frame
-            client.camera.up_direction = first.up
-            client.camera.position, client.camera.look_at = first.position, first.look_at
+            client.camera.up_direction = up
+            client.camera.position, client.camera.look_at = position, ahead
 
 
 def field_of_view(camera: Camera) -> float:

@@ -16,15 +16,10 @@ from emgs_jax.report.finished_run import TEXT_FILE, FinishedRun
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Texts that a map can be queried for.
-
-    Args:
-        known: texts with their vectors; None where `model` embeds any text.
-        model: embeds; None where the texts are those of `known`.
-    """
+    """Texts that a map can be queried for: those of `known`, or where `model` embeds any text."""
 
     source: str
-    width: int
+    width: int  # of the map's features
     known: TextEmbeddings | None
     model: FeatureModel | None = None
 
@@ -32,10 +27,8 @@ class Vocabulary:
         """Embed names, in their order; raises ValueError where there is no vector of one or it is too wide."""
         text = self._find(tuple(names)) if self.model is None else self.model.embed(tuple(names))
         if text.vectors.shape != (len(names), self.width):
-            raise ValueError(
-                f"{self.source} has embeddings of width {text.vectors.shape[1]}, and the map's features have width "
-                f"{self.width}: embed the words with the model that made the features"
-            )
+            widths = f"embeddings of width {text.vectors.shape[1]}, and the map's features have width {self.width}"
+            raise ValueError(f"{self.source} has {widths}: embed the words with the model that made the features")
         return text
 
     def _find(self, names: tuple[str, ...]) -> TextEmbeddings:
@@ -64,8 +57,7 @@ def feature_space(run: FinishedRun) -> dict[str, Any]:
 def vocabulary(run: FinishedRun, file: str | None, model: FeatureModel | None) -> Vocabulary:
     """Choose the vocabulary for a run's map: of the file if given, else of the model, else the run's classes.
 
-    Raises:
-        ValueError: the map has no features, or file or model are of other features; the message names both.
+    ValueError where the map has no features, or file or model are of other features; the message names both.
     """
     path = run.folder / "map.npz"
     features = np.asarray(run.map.gaussians.features)[np.asarray(run.map.gaussians.valid)]

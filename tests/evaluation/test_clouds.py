@@ -3,7 +3,6 @@
 import numpy as np
 import pytest
 from cloud_scene import random_cloud
-from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.evaluation.clouds import (
@@ -19,7 +18,7 @@ from emgs_jax.evaluation.clouds import (
     voxel_downsample,
 )
 from emgs_jax.geometry import Sim3
-from emgs_jax.io.ply import save_points_ply
+from emgs_jax.io.ply import save_points_ply, structured, write_ply
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 
@@ -48,15 +47,11 @@ def test_the_centre_of_a_points_cell_is_within_half_a_voxel_of_it():
     np.testing.assert_array_equal(cell_numbers(centers, 0.25), numbers)
 
 
-@pytest.mark.parametrize("num_neighbours", [1, 5])
-def test_nearest_points_are_those_of_scipys_tree(num_neighbours):
-    rng = np.random.default_rng(11)
-    points, queries = rng.normal(size=(300, 3)), rng.normal(size=(200, 3))
-    distances, rows = cKDTree(points).query(queries, np.arange(1, num_neighbours + 1))
-    found = NearestPoints(points).query(queries, num_neighbours)
-    np.testing.assert_allclose(found[0], distances, rtol=1e-12)
-    np.testing.assert_array_equal(found[1], rows)
-    assert NearestPoints(points[:3]).query(queries, 5)[1].shape == (200, 3)
+def test_of_few_points_all_are_the_nearest_and_of_none_there_are_none():
+    points, queries = np.diag([1.0, 2.0, 3.0]), np.zeros((200, 3))
+    distances, rows = NearestPoints(points).query(queries, 5)
+    np.testing.assert_array_equal(distances, np.tile([1.0, 2.0, 3.0], (200, 1)))
+    np.testing.assert_array_equal(rows, np.tile([0, 1, 2], (200, 1)))
     for nothing in (NearestPoints(points[:0]).query(queries), NearestPoints(points).query(queries[:0])):
         assert all(not values.size for values in nothing)
 
@@ -94,9 +89,8 @@ def test_fusing_pieces_is_reducing_the_whole_part_by_part(monkeypatch):
 
 def test_coarse_points_of_parts_are_those_of_the_whole():
     points = random_cloud(np.random.default_rng(5), 900).points
-    np.testing.assert_allclose(
-        coarse_points([points[::2], points[1::2]], 0.5), coarse_points([points], 0.5), atol=1e-12
-    )
+    found, whole = (coarse_points(parts, 0.5) for parts in ([points[::2], points[1::2]], [points]))
+    np.testing.assert_allclose(found, whole, atol=1e-12)
 
 
 @pytest.mark.parametrize("num_steps", [1, 4])
@@ -135,29 +129,16 @@ def test_a_cloud_that_is_read_keeps_its_normals_and_colours(tmp_path):
     np.testing.assert_allclose(found.colors, cloud.colors, atol=0.5 / 255 + 1e-6)
 
 
-def test_a_cloud_without_normals_gets_those_of_planes_through_its_points(tmp_path):
-    import trimesh
-
-    rng = np.random.default_rng(10)
-    across = np.array([0.6, 0.0, 0.8])
-    points = rng.uniform(-1, 1, (500, 3))
-    points -= np.outer(points @ across, across)
-    trimesh.PointCloud(points).export(tmp_path / "a.ply")
-    found = read_cloud(tmp_path / "a.ply", 12)
-    np.testing.assert_allclose(np.abs(found.normals @ across), 1.0, atol=1e-6)
-    assert not found.colors.any()
-
-
 def test_normals_of_a_mesh_whose_triangles_share_no_vertices_are_its_planes_and_those_of_a_line_unknown(tmp_path):
     """Neighbours that are one point six times have no plane, and (0, 0, 1) was taken for theirs."""
     x, y = (values.ravel() * 0.02 for values in np.meshgrid(np.arange(20.0), np.arange(20.0)))
     grid = np.column_stack([x, 0.6 * y, 0.8 * y])
     line = np.column_stack([np.linspace(5.0, 6.0, 20), np.zeros(20), np.zeros(20)])
-    points = np.repeat(np.concatenate([grid, line]), 6, axis=0)
-    save_points_ply(tmp_path / "a.ply", points, np.zeros_like(points), np.zeros_like(points))
-    normals = read_cloud(tmp_path / "a.ply", 12).normals
-    np.testing.assert_allclose(np.abs(normals[: 6 * 400] @ [0.0, -0.8, 0.6]), 1.0, atol=1e-4)
-    assert not normals[6 * 400 :].any()
+    points = np.repeat(np.concatenate([grid, line]), 6, axis=0).astype(np.float32)
+    write_ply(tmp_path / "a.ply", structured(points, ["x", "y", "z"]))
+    found = read_cloud(tmp_path / "a.ply", 12)
+    np.testing.assert_allclose(np.abs(found.normals[: 6 * 400] @ [0.0, -0.8, 0.6]), 1.0, atol=1e-4)
+    assert not found.normals[6 * 400 :].any() and not found.colors.any()
 
 
 def test_normals_of_length_0_are_none_and_others_get_length_1(tmp_path):
@@ -177,17 +158,16 @@ def test_a_file_without_usable_points_is_named(tmp_path):
     (tmp_path / "text.ply").write_text("no cloud")
     with pytest.raises(ValueError, match=r"text\.ply is no PLY file"):
         read_cloud(tmp_path / "text.ply", 12)
-    import open3d as o3d
-
-    points = np.zeros((5, 3))
-    points[1:3, 0] = np.nan, np.inf
-    o3d.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
-    with pytest.raises(ValueError, match=r"a\.ply: 2 of 5 points are not finite in x, y, z"):
-        read_cloud(tmp_path / "a.ply", 12)
-    points[1:3, 0] = 1.0, 2.0 * MAX_LENGTH_M
-    o3d.io.write_point_cloud(str(tmp_path / "a.ply"), o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points)))
-    with pytest.raises(ValueError, match=r"a\.ply has a point 2e\+\d+ m away"):
-        read_cloud(tmp_path / "a.ply", 12)
+    for x, message in (
+        ((0, np.nan, np.inf, 0, 0), r"a\.ply: 2 of 5 points are not finite in x, y, z"),
+        ((0, 1, 2 * MAX_LENGTH_M), r"a\.ply has a point 2e\+\d+ m away"),
+        ((), r"a\.ply has no points"),
+    ):
+        points = np.zeros((len(x), 3), np.float32)
+        points[:, 0] = x
+        write_ply(tmp_path / "a.ply", structured(points, ["x", "y", "z"]))
+        with pytest.raises(ValueError, match=message):
+            read_cloud(tmp_path / "a.ply", 12)
 
 
 @pytest.mark.parametrize(

@@ -2,18 +2,11 @@
 
 import numpy as np
 import pytest
+from hand_run import poses_along
 
 from emgs_jax.evaluation.loops import double_wall_share, loop_metrics
 
-
-def path(*positions: float) -> list[np.ndarray]:
-    poses = [np.eye(4) for _ in positions]
-    for pose, x in zip(poses, positions, strict=True):
-        pose[0, 3] = x
-    return poses
-
-
-THERE_AND_BACK = path(*range(40), *range(40, -1, -1))
+THERE_AND_BACK = [*poses_along([*range(40), *range(40, -1, -1)])]
 
 
 def between(a: int, b: int, truth: list[np.ndarray], error: float = 0.0, turn_deg: float = 0.0) -> tuple:

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from hydra.utils import instantiate
 
-from emgs_jax.config.configure import compose
+from emgs_jax.config.configure import build, compose
 from emgs_jax.evaluation.protocols import (
     NAMES,
     give_classes,
@@ -164,7 +164,7 @@ def test_points_without_a_class_vote_for_none_where_the_protocol_says_so_and_oth
     for none_votes, column in ((True, 4), (False, 1)):
         p = protocol("rayfronts", voxel_m=0.0, none_votes=none_votes)
         assert scene_confusion(found, truth, [], p)[1].tolist() == [int(i == column) for i in range(5)]
-    with pytest.raises(ValueError, match=r"protocol.compared_at must be truth or map, got 'mesh'"):
-        protocol("ovo", compared_at="mesh")
+    with pytest.raises(ValueError, match=r"protocol.compared_at must be one of truth, map; got 'mesh'"):
+        build(compose("protocol.compared_at=mesh", "map=x", "truth=x", name="segment"), "protocol")
     with pytest.raises(ValueError, match="same classes"):
         scene_confusion(replace(found, classes=("sofa",)), truth, [], protocol("ovo"))

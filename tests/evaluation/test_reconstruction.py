@@ -7,17 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 from cloud_scene import INTRINSICS, SHAPE, plane_depth, random_cloud
-from scene import evaluation_config
+from scene import compose, evaluation_config
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.config.configure import build
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Frame
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, spooled, transform_cloud
 from emgs_jax.evaluation.reconstruction import (
+    camera_cloud,
     compare_clouds,
     compare_placements,
     ground_truth_cloud,
-    posed_cloud,
+    posed,
     reconstruction_metrics,
     reference,
 )
@@ -38,15 +40,10 @@ def a_frame(depth, pose=None, index=0):
     return Frame(index, float(index), "f", image, depth.astype(np.float32), np.eye(4) if pose is None else pose)
 
 
-def test_wrong_config_values_are_named():
-    for name, value, message in (
-        ("alignment", "sim2", "alignment must be sim3 or se3, got 'sim2'"),
-        ("statistic", "median", "statistic must be mean or rmse, got 'median'"),
-        ("voxel_m", 0.0, "voxel_m must be positive, got 0.0"),
-        ("max_distance_m", float("nan"), "max_distance_m must be positive, got nan"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            dataclasses.replace(CONFIG, **{name: value})
+@pytest.mark.parametrize("value", ["alignment=sim2", "statistic=median", "voxel_m=0.0", "max_distance_m=nan"])
+def test_wrong_config_values_are_named(value):
+    with pytest.raises(ValueError, match=f"evaluation.{value.partition('=')[0]} must be .*got"):
+        build(compose(f"evaluation.{value}"), "evaluation")
 
 
 @pytest.mark.parametrize("protocol", ["paper", "mast3r", "nice_slam"])
@@ -59,80 +56,42 @@ def test_a_protocol_and_its_alignment_name_themselves_and_a_cloud_against_itself
     np.testing.assert_allclose([value for key, value in metrics.items() if key.endswith("percent")], 100.0)
 
 
-def test_parallel_planes_differ_by_their_distance_and_normals_by_the_cosines_of_their_angles():
-    """10 cm apart: inside the 20 cm threshold, outside the 5 cm one; half of the normals turned by 20°, half by 40°."""
-    truth = grid_cloud()
-    angles = np.radians(np.where(np.arange(len(truth)) % 2, 40.0, 20.0))
-    turned = np.stack([np.sin(angles), np.zeros_like(angles), np.cos(angles)], 1)
-    metrics = reconstruction_metrics(dataclasses.replace(truth, normals=turned), reference(truth, CONFIG), CONFIG)
-    expected = 50 * (np.cos(np.radians(20.0)) + np.cos(np.radians(40.0)))
-    np.testing.assert_allclose(metrics["reconstruction/normals_abs_cos_percent"], expected, rtol=1e-9)
-    assert metrics["reconstruction/normals_within_30deg_percent"] == 50.0
-    estimate = dataclasses.replace(grid_cloud(0.1), normals=-truth.normals)  # normals agree up to sign
-    metrics = reconstruction_metrics(estimate, reference(truth, CONFIG), CONFIG)
-    np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.1, rtol=1e-9)
-    np.testing.assert_allclose(metrics["reconstruction/completion_m"], 0.1, rtol=1e-9)
-    assert metrics["reconstruction/f1_20cm_percent"] == 100.0
-    assert metrics["reconstruction/f1_5cm_percent"] == 0.0
-    assert metrics["reconstruction/normals_abs_cos_percent"] == 100.0
-    assert metrics["reconstruction/num_points"] == 1600
-    # A random choice of points is the same each time; the distances grow with the gaps.
-    few = dataclasses.replace(CONFIG, max_points=400)
-    first, second = (reconstruction_metrics(estimate, reference(truth, few), few) for _ in range(2))
-    assert first == second and first["reconstruction/num_points"] == 1600
-    assert 0.1 < first["reconstruction/accuracy_m"] < 0.12 and first["reconstruction/f1_20cm_percent"] == 100.0
-
-
-def test_half_a_plane_has_full_precision_and_half_the_recall_and_a_far_outlier_counts_in_full():
-    truth = grid_cloud()
-    left = truth.points[:, 0] < 1.0
-    half = PointCloud(truth.points[left], truth.normals[left], truth.colors[left])
-    config = dataclasses.replace(CONFIG, f1_thresholds_m=(0.01,))
-    metrics = reconstruction_metrics(half, reference(truth, config), config)
-    assert metrics["reconstruction/precision_1cm_percent"] == 100.0
-    assert metrics["reconstruction/recall_1cm_percent"] == 50.0
-    np.testing.assert_allclose(metrics["reconstruction/f1_1cm_percent"], 200.0 / 3.0)
-    assert metrics["reconstruction/accuracy_m"] == 0.0
-    # Columns 1 … 20 of the missing half are 5, 10 … 100 cm away: the mean over all is half their mean.
-    np.testing.assert_allclose(metrics["reconstruction/completion_m"], 0.5 * 0.05 * 10.5)
-    points = np.concatenate([truth.points, [[0.003, 0.003, 1600.003]]])
-    estimate = PointCloud(points, np.zeros_like(points), np.zeros_like(points))
-    metrics = reconstruction_metrics(estimate, reference(truth, CONFIG), CONFIG)
-    np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 1600.0 / 1601.0, rtol=1e-9)
-
-
-def test_distances_and_normals_are_those_of_brute_force():
+@pytest.mark.parametrize(("statistic", "limit"), [("mean", np.inf), ("rmse", 0.1)])
+def test_metrics_are_those_of_brute_force(statistic, limit):
+    """A far point of the estimate counts in full, unless distances are clipped, which does not touch the F1."""
     rng = np.random.default_rng(1)
     estimate, truth = random_cloud(rng, 300), random_cloud(rng, 200)
-    config = dataclasses.replace(CONFIG, voxel_m=1e-4)
+    estimate.points[0] = [0.0, 0.0, 1600.0]
+    estimate.normals[1], truth.normals[2] = 0.0, 0.0
+    config = dataclasses.replace(CONFIG, voxel_m=1e-4, statistic=statistic, max_distance_m=limit)
     metrics = reconstruction_metrics(estimate, reference(truth, config), config)
     distances = np.linalg.norm(estimate.points[:, None] - truth.points[None], axis=-1)
     cosines = np.abs(estimate.normals @ truth.normals.T)
     there, back = distances.argmin(1), distances.argmin(0)
     both = [cosines[np.arange(300), there], cosines[back, np.arange(200)]]
-    expected = {
-        "accuracy_m": distances.min(1).mean(),
-        "completion_m": distances.min(0).mean(),
-        "precision_20cm_percent": 100 * (distances.min(1) <= 0.2).mean(),
-        "recall_20cm_percent": 100 * (distances.min(0) <= 0.2).mean(),
-        "normals_abs_cos_percent": 50 * (both[0].mean() + both[1].mean()),
-        "normals_within_30deg_percent": 50 * sum((cos >= np.cos(np.pi / 6)).mean() for cos in both),
-    }
+    both = [cos[cos > 0] for cos in both]  # but where a normal is unknown
+    expected = {"num_points": 300, "normals_abs_cos_percent": 50 * (both[0].mean() + both[1].mean())}
+    within = [100 * (cos >= np.cos(np.pi / 6)).mean() for cos in both]
+    expected["normals_within_30deg_percent"] = np.mean(within)
+    nearest = {"accuracy_m": distances.min(1), "completion_m": distances.min(0)}
+    for name, values in nearest.items():
+        clipped = np.minimum(values, limit)
+        expected[name] = clipped.mean() if statistic == "mean" else np.sqrt((clipped**2).mean())
+    for threshold in (20, 5):
+        precision, recall = (100 * (values <= threshold / 100).mean() for values in nearest.values())
+        expected[f"precision_{threshold}cm_percent"], expected[f"recall_{threshold}cm_percent"] = precision, recall
+        expected[f"f1_{threshold}cm_percent"] = 2 * precision * recall / (precision + recall)
+    found = {key.removeprefix("reconstruction/"): value for key, value in metrics.items()}
+    assert found.keys() == expected.keys()
     for name, value in expected.items():
-        np.testing.assert_allclose(metrics[f"reconstruction/{name}"], value, rtol=1e-6, err_msg=name)
+        np.testing.assert_allclose(found[name], value, rtol=1e-6, err_msg=name)
 
 
-def test_metrics_follow_a_similarity_of_both_clouds():
-    rng = np.random.default_rng(2)
-    estimate, truth = random_cloud(rng), random_cloud(rng)
-    move = Sim3(2.0, Rotation.random(rng=rng).as_matrix(), rng.normal(size=3))
-    small = dataclasses.replace(CONFIG, voxel_m=1e-4, f1_thresholds_m=(0.1,))
-    large = dataclasses.replace(CONFIG, voxel_m=1e-4, f1_thresholds_m=(0.2,))
-    before = list(reconstruction_metrics(estimate, reference(truth, small), small).values())
-    moved = transform_cloud(estimate, move), reference(transform_cloud(truth, move), large)
-    after = list(reconstruction_metrics(*moved, large).values())
-    np.testing.assert_allclose(after[:2], 2.0 * np.array(before[:2]), rtol=1e-6)
-    np.testing.assert_allclose(after[2:], before[2:], rtol=1e-6)
+def test_a_random_choice_of_points_is_the_same_each_time_and_distances_grow_with_the_gaps():
+    truth, few = grid_cloud(), dataclasses.replace(CONFIG, max_points=400)
+    first, second = (reconstruction_metrics(grid_cloud(0.1), reference(truth, few), few) for _ in range(2))
+    assert first == second and first["reconstruction/num_points"] == 1600
+    assert 0.1 < first["reconstruction/accuracy_m"] < 0.12 and first["reconstruction/f1_20cm_percent"] == 100.0
 
 
 def test_empty_clouds_and_unknown_normals_give_null_with_a_reason():
@@ -157,8 +116,8 @@ def test_the_prior_of_true_points_is_the_ground_truth_and_moves_with_the_poses()
     no_truth = Frame(1, 1.0, "g", frame.image)
     nowhere = Frame(2, 2.0, "h", frame.image, frame.depth)  # where it was taken nobody knows
     truth = ground_truth_cloud([frame, no_truth, nowhere], INTRINSICS, CONFIG)
-    view = (backproject(frame.depth, INTRINSICS), frame.depth > 0, frame.image, frame.T_world_camera)
-    raw = fuse_clouds([posed_cloud(*view, CONFIG)], CONFIG.voxel_m)
+    seen = camera_cloud(backproject(frame.depth, INTRINSICS), frame.depth > 0, frame.image, CONFIG)
+    raw = fuse_clouds([posed(seen, frame.T_world_camera)], CONFIG.voxel_m)
     np.testing.assert_array_equal(raw.points, truth.points)
     np.testing.assert_allclose(truth.colors, 0.2)
     # In the camera's frame the points lie on the plane again.
@@ -190,25 +149,6 @@ def test_a_cloud_is_aligned_by_the_poses_with_scale_or_without():
     rigid = evaluation_config("evaluation.alignment=se3")
     metrics = compare_clouds(estimate, reference(kept, rigid), (half, poses), rigid)
     np.testing.assert_allclose(metrics["reconstruction/accuracy_m"], 0.0, atol=1e-12)
-
-
-def test_distances_are_those_of_open3d_as_mean_and_as_clipped_rmse():
-    import open3d as o3d
-
-    rng = np.random.default_rng(8)
-    estimate, truth = random_cloud(rng, 900), random_cloud(rng, 700)
-    there, back = (o3d.geometry.PointCloud(o3d.utility.Vector3dVector(c.points)) for c in (estimate, truth))
-    distances = [np.asarray(a.compute_point_cloud_distance(b)) for a, b in ((there, back), (back, there))]
-    exact = dataclasses.replace(CONFIG, voxel_m=1e-5)
-    clipped = dataclasses.replace(exact, statistic="rmse", max_distance_m=0.1)
-    for config, average in ((exact, np.mean), (clipped, lambda values: np.sqrt(np.mean(np.minimum(values, 0.1) ** 2)))):
-        metrics = reconstruction_metrics(estimate, reference(truth, config), config)
-        for name, values in zip(("accuracy_m", "completion_m"), distances, strict=True):
-            np.testing.assert_allclose(metrics[f"reconstruction/{name}"], average(values), rtol=1e-6)
-        # what the distances are clipped to does not touch the F1
-        precision, recall = (100 * np.mean(values <= 0.2) for values in distances)
-        f1 = 2 * precision * recall / (precision + recall)
-        np.testing.assert_allclose(metrics["reconstruction/f1_20cm_percent"], f1)
 
 
 def test_icp_of_a_protocol_takes_back_a_small_motion_that_the_poses_do_not_show():

@@ -20,69 +20,44 @@ def a_frame(depth=2.0, index=0, gray=51):
     return Frame(index, 0.0, "f", image, None if depth is None else np.full(SHAPE, depth, np.float32))
 
 
-def metrics_of(frame, depth, colors=None, scale=1.0, max_depth=INF):
-    return rendering_metrics([score_view(frame, depth, colors, scale, max_depth)])
+def test_the_metrics_are_those_of_a_loop_over_pixels():
+    """Frames with holes and far pixels, rendered a quarter as large, with holes and what is no depth in them."""
+    rng, views, whole = np.random.default_rng(0), [], {"coverage": [], "within": [], "l1": [], "squares": []}
+    for number in range(3):
+        frame = a_frame(2.0, gray=40 * number)
+        frame.depth[:] = rng.choice([0.0, 1.0, 2.0, 9.0], SHAPE)
+        depth = frame.depth / 4 * rng.choice([0.0, 0.94, 0.96, 1.04, 1.06], SHAPE)
+        depth[0, :3] = np.nan, INF, -1.0
+        colors = rng.uniform(size=(*SHAPE, 3))
+        views.append(score_view(frame, depth, colors, 4.0, 5.0))
+        known, covered, errors = 0, 0, []
+        for place in np.ndindex(SHAPE):
+            if 0 < frame.depth[place] <= 5.0:
+                known += 1
+                if np.isfinite(depth[place]) and depth[place] > 0:
+                    covered += 1
+                    errors.append((abs(4 * depth[place] - frame.depth[place]), frame.depth[place]))
+                    whole["squares"] += [*(colors[place] - frame.image[place] / 255) ** 2]
+        whole["coverage"].append(100 * covered / known)
+        whole["within"].append(100 * sum(error <= 0.05 * true for error, true in errors) / known)
+        whole["l1"].append(np.mean([error for error, _ in errors]))
+    found = rendering_metrics([*views, score_view(a_frame(2.0), None, None, 4.0, 5.0)])  # one is lost
+    expected = {"coverage_percent": sum(whole["coverage"]) / 4, "depth_within_5_percent": sum(whole["within"]) / 4}
+    expected |= {"worst_coverage_percent": 0.0, "num_frames": 4, "depth_l1_m": np.mean(whole["l1"])}
+    expected |= {"psnr_db": -10 * np.log10(np.mean(whole["squares"]))}
+    for name, value in expected.items():
+        np.testing.assert_allclose(found[f"rendering/{name}"], value, rtol=1e-5, err_msg=name)  # of float32
+    assert len(whole["l1"]) == 3 and 0 < whole["within"][0] < whole["coverage"][0] < 100
+    plain = rendering_metrics([score_view(a_frame(), np.full(SHAPE, 2.0), None, 1.0, INF)])
+    assert plain["rendering/psnr_db"] is None, "no colours were rendered"
 
 
-def half(value):
-    """Depth on the left half of the image, none on the right."""
-    depth = np.full(SHAPE, value, np.float32)
-    depth[:, 3:] = 0.0
-    return depth
-
-
-def test_a_plane_at_two_metres_of_which_half_is_rendered_five_centimetres_behind_it():
-    metrics = metrics_of(a_frame(), half(2.05), np.full((*SHAPE, 3), 0.3))
-    assert metrics["rendering/coverage_percent"] == metrics["rendering/worst_coverage_percent"] == 50.0
-    assert metrics["rendering/depth_within_5_percent"] == 50.0, "what is not rendered is not within"
-    assert metrics["rendering/depth_l1_m"] == pytest.approx(0.05, abs=1e-6)  # float32
-    assert metrics["rendering/psnr_db"] == pytest.approx(20.0)  # an error of .1 everywhere
-    assert metrics["rendering/num_frames"] == 1
-    for depth, within in ((1.89, 0.0), (1.91, 100.0), (2.09, 100.0), (2.11, 0.0)):  # of the true depth
-        assert metrics_of(a_frame(), np.full(SHAPE, depth))["rendering/depth_within_5_percent"] == within
-
-
-def test_the_depth_is_brought_to_metres_by_the_scale_of_the_alignment():
-    metrics = metrics_of(a_frame(), np.full(SHAPE, 0.5), scale=4.0)
-    assert metrics["rendering/depth_l1_m"] == 0.0 and metrics["rendering/depth_within_5_percent"] == 100.0
+def test_the_scale_of_a_depth_is_that_of_the_alignment():
     truth = poses_along([0.0, 1.0, 3.0])
     poses = truth.copy()
     poses[:, :3, 3] *= 0.25
     assert depth_scale((poses, truth), evaluation_config()) == pytest.approx(4.0)
     assert depth_scale((poses, truth), evaluation_config("evaluation.alignment=se3")) == 1.0
-
-
-def test_pixels_without_a_true_depth_and_beyond_the_farthest_one_do_not_count():
-    frame = a_frame()
-    frame.depth[0], frame.depth[1] = 0.0, 9.0
-    depth, colors = np.full(SHAPE, 2.0), np.full((*SHAPE, 3), 0.2)
-    depth[:2], colors[:2] = 0.0, 1.0
-    metrics = metrics_of(frame, depth, colors, max_depth=5.0)
-    assert metrics["rendering/coverage_percent"] == 100.0 and metrics["rendering/depth_l1_m"] == 0.0
-    assert metrics["rendering/psnr_db"] > 100.0
-    assert metrics_of(frame, depth, colors)["rendering/coverage_percent"] == pytest.approx(100.0 * 2 / 3)
-
-
-def test_means_are_over_frames_and_what_is_no_depth_is_not_covered_and_has_no_error():
-    for poison in (float("nan"), INF, -1.0):
-        depth = half(2.0)
-        depth[:, 3:] = poison
-        assert metrics_of(a_frame(), depth) == metrics_of(a_frame(), half(2.0))
-    views = [np.full(SHAPE, 2.0), half(2.2), np.zeros(SHAPE)]
-    metrics = rendering_metrics([score_view(a_frame(), depth, None, 1.0, INF) for depth in views])
-    assert metrics["rendering/coverage_percent"] == pytest.approx(50.0)
-    assert metrics["rendering/worst_coverage_percent"] == 0.0
-    assert metrics["rendering/depth_l1_m"] == pytest.approx(0.1, abs=1e-6)  # of 0 and .2
-    assert metrics["rendering/depth_within_5_percent"] == pytest.approx(100.0 / 3)
-    assert metrics["rendering/psnr_db"] is None, "no colours were rendered"
-
-
-def test_the_psnr_is_of_all_covered_pixels_together():
-    """24 pixels with an error of .1 and 12 with one of .4: (24 · .01 + 12 · .16) / 36 = .06."""
-    colors = np.full((*SHAPE, 3), 0.2)
-    views = [(np.full(SHAPE, 2.0), colors + 0.1), (half(2.0), colors + 0.4)]
-    metrics = rendering_metrics([score_view(a_frame(), *view, 1.0, INF) for view in views])
-    assert metrics["rendering/psnr_db"] == pytest.approx(-10.0 * np.log10(0.06))
 
 
 def test_frames_without_true_depth_do_not_count_and_without_any_truth_nothing_is_defined():
@@ -126,7 +101,7 @@ def test_frames_that_are_not_added_are_lost_and_covered_nowhere_and_the_farthest
     assert metrics["rendering/worst_coverage_percent"] == 0.0
     assert metrics["rendering/depth_l1_m"] == pytest.approx(0.0, abs=1e-12)
     near = dataclasses.replace(evaluation_config(), max_depth_m=3.5)
-    metrics = rendered_of(near, _0=half(2.0), _1=half(3.0))
+    metrics = rendered_of(near, _0=np.full(SHAPE, 2.0))
     assert metrics["rendering/num_frames"] == 2 and metrics["rendering/coverage_percent"] == 50.0
 
 

@@ -7,18 +7,16 @@ from emgs_jax.data.base import Frame
 from emgs_jax.data.class_file import ClassFile
 from emgs_jax.evaluation import segmentation
 from emgs_jax.evaluation.segmentation import (
-    DistinctCells,
     LabelledPoints,
     SpooledLabels,
+    TrueLabels,
     compare_labels,
     confusion_matrix,
-    label_cells,
     nearest_classes,
     read_labelled_mesh,
     segmentation_metrics,
     transfer_labels,
     translate,
-    true_labels,
 )
 from emgs_jax.io.ply import structured, write_ply
 
@@ -94,22 +92,23 @@ class Planes:
 
 def truth_of(room: "Planes", frames: list[Frame]) -> LabelledPoints | None:
     """True labels per voxel of 5 cm of what is nearer than 5 m."""
-    cells = DistinctCells()
+    labels = TrueLabels(room, 0.05, 5.0)
     for frame in frames:
-        cells.append(label_cells(frame, room, 0.05, 5.0))
-    return true_labels(cells, room, 0.05)
+        labels.append(frame)
+    return labels.points()
 
 
-def test_cells_of_many_frames_are_merged_on_the_way_and_are_each_once(monkeypatch):
+def test_voxels_of_many_frames_are_merged_on_the_way_and_are_each_once(monkeypatch):
     """Of 1,000 frames of one room they were 40 million rows, which are sorted at once: gigabytes."""
+    room = Planes()
+    frames = [room.frame(offset) for offset in (0.0, 0.1, 0.2, 0.3)]
+    whole, labels = truth_of(room, frames), TrueLabels(room, 0.05, 5.0)
     monkeypatch.setattr(segmentation, "_MERGE_ROWS", 10)
-    rng, cells, all_rows = np.random.default_rng(0), DistinctCells(), []
-    for _ in range(30):
-        all_rows.append(np.unique(rng.integers(0, 4, (8, 2)), axis=0))
-        cells.append(all_rows[-1])
-        assert sum(map(len, cells._rows)) <= 16 + 10 + 8
-    expected = np.unique(np.concatenate(all_rows)[:, ::-1], axis=0)[:, ::-1]
-    np.testing.assert_array_equal(cells.rows(), expected)
+    for number in range(30):
+        labels.append(frames[number % 4])
+        assert sum(map(len, labels._rows)) <= 2 * len(whole.labels) + 380
+    for name in ("points", "labels"):
+        np.testing.assert_array_equal(getattr(labels.points(), name), getattr(whole, name))
 
 
 def test_true_points_are_the_voxels_that_a_class_is_seen_in_each_once():
@@ -154,11 +153,11 @@ def test_the_class_of_a_voxel_is_that_of_most_views_and_a_view_counts_once(monke
 
 def test_classes_of_many_views_are_counted_a_range_of_cells_at_a_time(monkeypatch):
     """Of 1,000 frames the pairs of all views were sorted at once: gigabytes."""
-    rng, sizes, whole = np.random.default_rng(0), [], segmentation._most_seen
+    rng, sizes, whole = np.random.default_rng(0), [], segmentation.most_seen
     seen, found = SpooledLabels(tuple("abcd")), []
     for _ in range(20):
         seen.append(rng.uniform(-5.0, 5.0, (500, 3)), rng.integers(0, 4, 500))
-    monkeypatch.setattr(segmentation, "_most_seen", lambda rows: sizes.append(len(rows)) or whole(rows))
+    monkeypatch.setattr(segmentation, "most_seen", lambda rows: sizes.append(len(rows)) or whole(rows))
     for most in (500, 500_000):
         monkeypatch.setattr("emgs_jax.evaluation.clouds.PART_ROWS", most)
         found.append(seen.points(0.5))

@@ -37,9 +37,7 @@ def noisy(rng, poses, sigma):
 
 
 def scaled(poses, factor):
-    out = poses.copy()
-    out[:, :3, 3] *= factor
-    return out
+    return Sim3.about(np.zeros(3), factor).apply_to_poses(poses)
 
 
 def assert_same_alignment(found, made, atol=1e-9):

@@ -55,10 +55,13 @@ def test_a_table_is_markdown_or_aligned_text_and_the_best_of_several_rivals_is_m
         Line([name], {column.key: value}, rivals=rivals)
         for name, value, rivals in (("a", 0.02, 0), ("bcd", 0.1, 0), ("e", None, 0), ("f", 0.01, 1), ("g", 0.01, None))
     ]
-    assert known([*MAIN[1:], column], lines) == [column] and known([column], lines[2:3]) == []
-    table = metric_table([""], [column], lines)
+    values = [line.values for line in lines]
+    assert known([*MAIN[1:], column], values) == [column] and known([column], values[2:3]) == []
+    table = metric_table([""], [column], lines, ["tum"])
     assert [line[1] for line in table.lines] == [Cell("2", "best"), Cell("10"), Cell(DASH), Cell("1"), Cell("1")]
     table = table._replace(lines=table.lines[:2])
     assert markdown(table) == "|  | e |\n| --- | --- |\n| a | **2** |\n| bcd | 10 |\n"
     assert aligned(table) == "      e\n───────\na     2\nbcd  10"
+    lengths = [(("tum",), "cm"), (("colmap",), ".01 units"), (("colmap", "tum"), "cm or .01 units")]
+    assert [metric_table([], MAIN[:1], [], data).titles for data, _ in lengths] == [[f"ATE [{x}]"] for _, x in lengths]
     assert transposed(table) == Table(["", "a", "bcd"], [("e", Cell("2", "best"), Cell("10"))])

@@ -89,12 +89,15 @@ class Truth:
         return Frame(index, 0.0, "f", image, np.full((16, 24), 4.0, np.float32), labels=labels)
 
 
-def test_the_views_are_compared_with_their_frames_at_the_size_of_the_alignment_and_lost_ones_are_empty(run, dense):
-    """Coverage is that of the points: the wall fills every view, a sixth of which is lost."""
+def compared(run):
     larger = np.stack(run.poses)
     larger[:, :3, 3] *= 2.0
-    compared = hand_run(run.poses, run.raw_poses, larger, gaussians=run.state.map.gaussians)
-    found = dense_map(compared, Truth(), densify_config(), evaluation_config(), num_pictures=0)
+    return hand_run(run.poses, run.raw_poses, larger, gaussians=run.state.map.gaussians)
+
+
+def test_the_views_are_compared_with_their_frames_at_the_size_of_the_alignment_and_lost_ones_are_empty(run, dense):
+    """Coverage is that of the points: the wall fills every view, a sixth of which is lost."""
+    found = dense_map(compared(run), Truth(), densify_config(), evaluation_config(), num_pictures=0)
     np.testing.assert_array_equal(found.cloud.points, dense.cloud.points)
     metrics = found.rendering
     assert metrics["rendering/num_frames"] == len(STATUSES) and metrics["rendering/worst_coverage_percent"] == 0.0
@@ -102,21 +105,15 @@ def test_the_views_are_compared_with_their_frames_at_the_size_of_the_alignment_a
     np.testing.assert_allclose(metrics["rendering/depth_within_5_percent"], metrics["rendering/coverage_percent"])
     assert metrics["rendering/depth_l1_m"] < 2 * 2e-3  # as of the points
     gray = np.arange(len(STATUSES)) / 5
-    errors = [
-        [(x / 20 - value) ** 2, (0.25 - value) ** 2, (0.5 - value) ** 2]
-        for x, value, status in zip(XS, gray, STATUSES, strict=True)
-        if status != "lost"
-    ]
+    is_seen = np.array(STATUSES) != "lost"
+    errors = (np.stack([XS / 20, np.full_like(XS, 0.25), np.full_like(XS, 0.5)]) - gray)[:, is_seen] ** 2
     np.testing.assert_allclose(metrics["rendering/psnr_db"], -10 * np.log10(np.mean(errors)), atol=0.05)
     assert dense.rendering == {}, "nobody knows the truth"
     assert metrics["rendering/label_accuracy_percent"] is None, "the map has no classes"
 
 
 def test_the_classes_of_rendered_pixels_are_compared_with_those_of_the_frames_by_name(run, labels):
-    larger = np.stack(run.poses)
-    larger[:, :3, 3] *= 2.0
-    compared = hand_run(run.poses, run.raw_poses, larger, gaussians=run.state.map.gaussians)
-    metrics = dense_map(compared, Truth(), densify_config(), evaluation_config(), labels, num_pictures=0).rendering
+    metrics = dense_map(compared(run), Truth(), densify_config(), evaluation_config(), labels, num_pictures=0).rendering
     np.testing.assert_allclose(metrics["rendering/label_accuracy_percent"], 100.0 * 5 / 6, atol=0.5)  # one is lost
 
 
@@ -133,16 +130,15 @@ def own_run(run, scale):
     return found
 
 
-def own_cloud(run, scale, own):
-    config = densify_config("densify.points=own")
-    return dense_map(own_run(run, scale), Pictures(), config, evaluation_config(), own=own).cloud
+def own_cloud(run, own):
+    return dense_map(run, Pictures(), densify_config("densify.points=own"), evaluation_config(), own=own).cloud
 
 
 def test_a_point_lies_where_its_frame_puts_it_unless_the_map_shows_another_surface_there(run):
     """The wall is at 2: left of the camera the frames say 2.05, right of it 3, and in the upper row nothing."""
     said = np.full((len(STATUSES), 16, 24), 1.025, np.float32)
     said[:, :, 12:], said[:, 0] = 1.5, 0.0
-    found = own_cloud(run, 2.0, own_points(run, said))
+    found = own_cloud(own_run(run, 2.0), own_points(run, said))
     np.testing.assert_allclose(found.points[:, 2], 2.05, atol=1e-5)  # float32
     np.testing.assert_allclose(found.normals, np.broadcast_to([0.0, 0.0, -1.0], found.normals.shape), atol=1e-5)
     offsets = found.points[:, None, 0] - XS[[status != "lost" for status in STATUSES]]
@@ -154,14 +150,11 @@ def test_a_point_lies_where_its_frame_puts_it_unless_the_map_shows_another_surfa
 def test_the_map_is_asked_where_a_point_appears_which_need_not_be_the_pixel_that_it_is_of(run):
     """The wall ends at x = 1 of frame 0: its right half shows nothing. Points are four pixels right of their rays."""
     half = own_run(run, 1.0)
-    half.state.map = eqx.tree_at(
-        lambda m: m.gaussians.valid, half.state.map, half.state.map.gaussians.means[:, 0] < XS[0]
-    )
-    said = np.full((len(STATUSES), 16, 24), 3.0, np.float32)
-    config = densify_config("densify.points=own")
-    own = own_points(run, said, shift=4.0)
+    map = half.state.map
+    half.state.map = eqx.tree_at(lambda m: m.gaussians.valid, map, map.gaussians.means[:, 0] < XS[0])
+    own = own_points(run, np.full((len(STATUSES), 16, 24), 3.0, np.float32), shift=4.0)
     own[1:] = 0.0
-    found = dense_map(half, Pictures(), config, evaluation_config(), own=own).cloud
+    found = own_cloud(half, own)
     drawn = dense_map(half, Pictures(), densify_config(), evaluation_config()).cloud
     edge = 24 * (drawn.points[:, 0].max() - XS[0]) / 2.0  # pixels right of the camera's axis that the map covers
     np.testing.assert_allclose(24 * (found.points[:, 0].min() - XS[0]) / 3.0, edge + 1.0, atol=0.6)

@@ -11,39 +11,23 @@ from emgs_jax.config.configure import build
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.render.composite import render
 from emgs_jax.render.densify import densify
-from emgs_jax.report.display import LARGEST, closing_covariances
 from emgs_jax.report.finished_run import read_run
-
-
-def read_gaussians(path) -> Gaussians:
-    """map.ply as a 3DGS rasteriser reads it; the normals, which that one does not look at, are those written."""
-    rows = read_vertices(path)
-
-    def columns(*names):
-        return np.stack([rows[name].astype(np.float32) for name in names], axis=1)
-
-    axes = Rotation.from_quat(columns("rot_0", "rot_1", "rot_2", "rot_3"), scalar_first=True).as_matrix()
-    axes = axes * np.exp(columns("scale_0", "scale_1", "scale_2"))[:, None]
-    colors = 0.5 + 0.28209479177387814 * columns("f_dc_0", "f_dc_1", "f_dc_2")
-    means, count = columns("x", "y", "z"), len(axes)
-    covs = (axes @ axes.mT).astype(np.float32)
-    normals = columns("nx", "ny", "nz")
-    features, valid = np.zeros((count, 0), np.float32), np.ones(count, bool)
-    return Gaussians(*map(jnp.asarray, (means, covs, colors, normals, features, valid)))
+from emgs_jax.report.layers import LARGEST, closing_covariances
+from emgs_jax.report.splats import read_splats
 
 
 def test_map_ply_drawn_as_3dgs_draws_it_closes_every_view(exact_run):
     """gsplat's convention: blur .3 px, its own opacity, up to 3.33 standard deviations; 98 % of what a view sees."""
     folder, _ = exact_run
     run, config = read_run(folder), build(compose(), "densify")
-    drawn, gaussians = read_gaussians(folder / "map.ply"), confirmed(run.map)
+    splats, gaussians = read_splats(folder / "map.ply"), confirmed(run.map)
+    arrays = splats.means, splats.covs, splats.colors[:, :3], splats.normals, np.zeros((len(splats.means), 0))
+    drawn = Gaussians(*(jnp.asarray(x, jnp.float32) for x in arrays), jnp.ones(len(splats.means), bool))
     theirs = eqx.tree_at(lambda c: (c.covariance_scale, c.blur, c.radius), config.render, (1.0, 0.3, 3.33))
     theirs = jax.tree.map(jnp.float32, theirs)
-    opacity = 1 / (1 + np.exp(-read_vertices(folder / "map.ply")["opacity"]))
-    np.testing.assert_allclose(opacity, float(theirs.opacity), rtol=1e-6)
+    np.testing.assert_allclose(splats.colors[:, 3], float(theirs.opacity), rtol=1e-6)
     for pose in run.poses:
         seen = np.asarray(jax.jit(densify)(gaussians, to_se3(pose), run.camera, config).valid)
         picture = jax.jit(render)(drawn, drawn.colors, to_se3(pose), run.camera, theirs)

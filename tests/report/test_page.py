@@ -16,11 +16,10 @@ from written_run import CLASSES, two_walls, written_run
 from emgs_jax.config.configure import groups
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.io.ply import save_gaussians_ply
-from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.evaluation_page import run_facts
 from emgs_jax.report.finished_run import placed_paths, read_run
 from emgs_jax.report.html import DATA_LICENCES
-from emgs_jax.report.layers import COV_UNIT, fitted, packed, thinned
+from emgs_jax.report.layers import COV_UNIT, closing_covariances, fitted, packed, thinned
 from emgs_jax.report.page import write_report
 from emgs_jax.report.page_strip import strip
 from emgs_jax.report.page_words import errors, verdict

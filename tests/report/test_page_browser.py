@@ -19,8 +19,8 @@ from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.splats import draw
 from emgs_jax.render.composite import render
-from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.finished_run import read_run, render_config
+from emgs_jax.report.layers import closing_covariances
 from emgs_jax.report.page import write_report
 
 BACKGROUND = np.array([0.086, 0.098, 0.118])  # main.js

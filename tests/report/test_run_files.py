@@ -13,7 +13,7 @@ from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.io.map_file import load_map
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.report.dense import DenseMap
-from emgs_jax.report.display import closing_covariances
+from emgs_jax.report.layers import closing_covariances
 from emgs_jax.report.run_files import OUTPUTS, claim_folder, save_outputs, save_progress
 
 NUM_FRAMES = len(STATUSES)

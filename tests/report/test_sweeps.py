@@ -6,10 +6,10 @@ import json
 import numpy as np
 import pytest
 
-from emgs_jax.report import heat_map
+from emgs_jax.report import sweep_page
 from emgs_jax.report.columns import csv_text
-from emgs_jax.report.heat_map import draw
-from emgs_jax.report.sweeps import SweepResults, read_sweep, table
+from emgs_jax.report.sweep_page import draw, table
+from emgs_jax.report.sweeps import SweepResults, read_sweep
 
 ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_5cm_percent"
 PROVENANCE = {"data": {"name": "room"}, "prior": {"name": "simulated", "settings": {"seed": 0}}, "config": {"a": 1}}
@@ -29,7 +29,7 @@ def grid():
 
 
 def test_the_best_of_each_column_is_bold_low_errors_and_high_scores():
-    lines = [[text.strip() for text in line.split("|")[1:-1]] for line in table(grid(), list(AXES)).splitlines()]
+    lines = [[text.strip() for text in line.split("|")[1:-1]] for line in table(grid(), [*AXES], "room").splitlines()]
     assert lines[0] == [*AXES, "ATE [cm]", "F1@.05 [%]"]
     assert lines[2] == ["0.5", "0.01", "**1.00**", "10.0"]
     assert lines[6] == ["1.0", "0.02", "5.00", "**50.0**"]
@@ -39,41 +39,42 @@ def test_the_best_of_each_column_is_bold_low_errors_and_high_scores():
 
 @pytest.fixture
 def drawn(monkeypatch, tmp_path):
-    """`draw` with the maps and the title of the picture in place of it."""
-    calls = []
-    monkeypatch.setattr(heat_map, "draw_heat_maps", lambda _, *arguments: calls.append(arguments))
-    return lambda rows, axes: (draw(tmp_path / "map.png", rows, axes, "a sweep"), calls)
+    """`draw`: what it says, and its figure."""
+    figures, figure = [], sweep_page.Figure
+    monkeypatch.setattr(sweep_page, "Figure", lambda **look: figures.append(figure(**look)) or figures[-1])
+    return lambda rows, axes, data="room": (draw(tmp_path / "map.png", rows, axes, "a sweep", data), figures)
 
 
-def test_the_picture_has_the_value_of_each_setting_at_its_place_as_means_over_other_axes(drawn):
+@pytest.mark.parametrize(("data", "unit"), [("room", "cm"), ("colmap", ".01 units")])
+def test_the_picture_has_the_value_of_each_setting_at_its_place_as_means_over_other_axes(drawn, data, unit, tmp_path):
     rows = [row | {"slam.window_size": size, ATE: row[ATE] * size} for row in grid() for size in (1, 3)]
-    reason, ((maps, down, across, title),) = drawn(rows, AXES | {"slam.window_size": [1, 3]})
-    assert reason is None and title == "a sweep, means over slam.window_size"
-    assert (down, across) == (("slam.em.noise", ["0.5", "1.0"]), ("slam.em.min_std", ["0.01", "0.02", "0.03"]))
-    (ate, errors), (f1, scores) = maps
-    np.testing.assert_allclose(errors, 2.0 * np.array([[1, 2, 3], [4, 5, 6]]))
-    np.testing.assert_allclose(scores, [[10, 20, 30], [40, 50, np.nan]])
-    assert (ate.key, f1.key) == (ATE, F1)
+    reason, (figure,) = drawn(rows, AXES | {"slam.window_size": [1, 3]}, data)
+    assert reason is None and figure.get_suptitle() == "a sweep, means over slam.window_size"
+    ate, f1 = (panel for panel in figure.axes if panel.images)
+    assert (ate.get_title(), f1.get_title()) == (f"ATE [{unit}]", "F1@.05 [%]")
+    assert (ate.get_ylabel(), ate.get_xlabel()) == tuple(AXES)
+    ticks = [[text.get_text() for text in texts] for texts in (ate.get_yticklabels(), ate.get_xticklabels())]
+    assert ticks == [[str(value) for value in values] for values in AXES.values()]
+    np.testing.assert_allclose(ate.images[0].get_array(), 2.0 * np.array([[1, 2, 3], [4, 5, 6]]))
+    np.testing.assert_allclose(f1.images[0].get_array().filled(np.nan), [[10, 20, 30], [40, 50, np.nan]])
+    assert (tmp_path / "map.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_without_two_axes_or_without_truth_there_is_no_picture_but_a_reason(drawn):
     assert "two axes" in drawn(grid(), {"slam.em.noise": [0.5, 1.0], "slam.em.min_std": [0.01]})[0]
-    reason, calls = drawn([{name: row[name] for name in AXES} for row in grid()], AXES)
-    assert "no ground truth" in reason and not calls
+    reason, figures = drawn([{name: row[name] for name in AXES} for row in grid()], AXES)
+    assert "no ground truth" in reason and not figures
 
 
-def test_brighter_is_better_in_the_picture_of_either_kind_of_metric(tmp_path, monkeypatch):
+def test_brighter_is_better_in_the_picture_of_either_kind_of_metric(drawn):
     """The same numbers as an error and as a score: the bright end is the other one, and its text is dark."""
-    figures, figure = [], heat_map.Figure
-    monkeypatch.setattr(heat_map, "Figure", lambda **look: figures.append(figure(**look)) or figures[-1])
     rows = [{name: row[name] for name in AXES} | {ATE: row[ATE], F1: row[ATE]} for row in grid()]
-    assert draw(tmp_path / "map.png", rows, AXES, "") is None
-    for axes, bright in zip(figures[0].axes[:2], ("1.00", "0.1"), strict=True):
+    _, (figure,) = drawn(rows, AXES)
+    for axes, bright in zip(figure.axes[:2], ("1.00", "0.1"), strict=True):
         (image,), texts = axes.images, [(text.get_text(), text.get_color()) for text in axes.texts]
         light = image.cmap(image.norm(image.get_array()))[..., :3].mean(-1)
         assert (light[0, 0] > light[1, 2] + 0.1) == (bright == "1.00")
         assert [text for text, color in texts if color == "black"][:1] == [bright] and len(texts) == 6
-    assert (tmp_path / "map.png").read_bytes()[:4] == b"\x89PNG"
 
 
 def test_results_are_there_again_when_a_sweep_goes_on_and_rows_come_in_the_order_asked_for(tmp_path):

@@ -1,5 +1,7 @@
 """What a search leaves; oracles: results written by hand, YAML that is read back."""
 
+from dataclasses import replace
+
 import pytest
 import yaml
 
@@ -12,7 +14,7 @@ OBJECTIVES = {ATE: "minimize", OTHER: "maximize"}
 def results(name: str, is_held_out: bool, default: float, trial: float, raw: float | None = 0.05) -> SequenceResults:
     raws = {} if raw is None else {f"raw_prior/{ATE}": raw}
     metrics = {"default": {ATE: default, F1: 50.0, OTHER: 100} | raws, "trial 7": {ATE: trial, F1: 40.0, OTHER: 120}}
-    return SequenceResults(name, is_held_out, True, metrics)
+    return SequenceResults(name, "tum", is_held_out, True, metrics)
 
 
 ALL = [results("a", False, 0.02, 0.01), results("b", False, 0.04, 0.01), results("c", True, 0.03, 0.06)]
@@ -25,6 +27,8 @@ def lines_of(text: str) -> list[list[str]]:
 def test_what_is_held_out_stands_apart_with_the_prior_the_default_and_the_best():
     lines = lines_of(table(ALL, OBJECTIVES))
     assert lines[0][3:5] == ["ATE [cm]", OTHER] and "F1@.05 [%]" in lines[0]
+    others = [replace(result, data="colmap") for result in ALL[:2]]
+    assert lines_of(table([*others, ALL[2]], OBJECTIVES))[0][3] == "ATE [cm or .01 units]"
     rows = [line[:5] for line in lines[2:]]
     assert rows[:3] == [
         ["tuned", "a, simulated", "raw prior", "5.00", "–"],
@@ -67,6 +71,6 @@ def test_settings_are_an_option_for_the_whole_config():
 @pytest.mark.parametrize("objectives", [OBJECTIVES, {ATE: "minimize"}])
 def test_the_picture_shows_trials_that_have_a_value_or_says_that_there_is_none(tmp_path, objectives):
     rows = [{"trial": 0, ATE: 0.02, OTHER: 100}, {"trial": 1, ATE: None, OTHER: 100}]
-    assert draw_trials(tmp_path / "tune.png", rows, objectives, {0: "default"}, "a search") is None
+    assert draw_trials(tmp_path / "tune.png", rows, objectives, {0: "default"}, "a search", ["tum"]) is None
     assert (tmp_path / "tune.png").read_bytes()[:4] == b"\x89PNG"
-    assert draw_trials(tmp_path / "no.png", rows[1:], objectives, {}, "") == "no trial has all objectives"
+    assert draw_trials(tmp_path / "no.png", rows[1:], objectives, {}, "", ["tum"]) == "no trial has all objectives"

@@ -17,9 +17,8 @@ from written_run import CLASSES, two_walls, written_run
 from emgs_jax.config import configure
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.ops.camera import Camera
-from emgs_jax.report.display import closing_covariances
 from emgs_jax.report.finished_run import read_run
-from emgs_jax.report.layers import covariances, map_layers, painted
+from emgs_jax.report.layers import closing_covariances, covariances, map_layers, painted
 from emgs_jax.report.viewer import HOST, Viewer
 from emgs_jax.report.viewer_answers import ask, find_words, highlighted, picked
 from emgs_jax.report.viewer_scene import field_of_view, shown
@@ -115,13 +114,12 @@ def test_the_field_of_view_is_the_angle_between_the_upper_and_the_lower_edge_of_
     assert np.isclose(field_of_view(Camera((1.0, 50.0), (0.0, 0.0), 30, 100)), np.pi / 2)
 
 
-def test_words_and_layers_recolour_what_is_served(viewer):
-    walls = two_walls()
-    is_sofa = np.asarray(walls.features)[:, 1] > 0.5
-    before = np.array(viewer.scene.splats.rgbs)
+def check_colours(viewer, drawn):
+    """Words and layers recolour what is served, and it gets its own colours back."""
+    is_sofa, before = np.asarray(two_walls().features)[:, 1] > 0.5, np.array(drawn.rgbs)
     viewer.words.value = "sofa"
     viewer.recolor()
-    found = np.array(viewer.scene.splats.rgbs)
+    found = np.array(drawn.rgbs)
     assert found[is_sofa].max(1).min() > 130 and found[~is_sofa].max() < 70
     assert f"{is_sofa.sum():,} of {len(is_sofa):,}" in viewer.answer.content
     viewer.against.value = "sofa"
@@ -130,41 +128,31 @@ def test_words_and_layers_recolour_what_is_served(viewer):
     viewer.words.value = viewer.against.value = ""
     viewer.layer.value = "normals"
     viewer.recolor()
-    np.testing.assert_array_equal(np.array(viewer.scene.points.colors), painted(viewer.layers, "normal"))
+    for colors in (drawn.rgbs, viewer.scene.points.colors):
+        np.testing.assert_array_equal(np.array(colors), painted(viewer.layers, "normal"))
     viewer.layer.value = "colour"
     viewer.recolor()
-    np.testing.assert_array_equal(np.array(viewer.scene.splats.rgbs), before)
+    np.testing.assert_array_equal(np.array(drawn.rgbs), before)
 
 
-def test_a_polished_run_can_be_shown_as_its_splats(tmp_path, viewer):
-    walls = two_walls()
-    folder = written_run(tmp_path / "run")
+def test_words_and_layers_recolour_what_is_served(viewer):
+    check_colours(viewer, viewer.scene.splats)
+    assert viewer.kind.options == ("Gaussians", "points") and viewer.scene.sharp is None
+
+
+def test_a_polished_run_can_be_shown_as_its_splats(tmp_path):
+    walls, folder = two_walls(), written_run(tmp_path / "run")
     save_gaussians_ply(folder / "splats.ply", walls.means, walls.covs, walls.colors, 0.25, walls.normals)
-    polished = Viewer(shown(read_run(folder)), free_port())
-    try:
+    with looked_for(read_run(folder), "") as polished:
         sharp, gaussians = polished.scene.sharp, polished.scene.splats
         assert polished.kind.options == ("splats", "Gaussians", "points")
         assert (sharp.visible, gaussians.visible) == (True, False)
         np.testing.assert_allclose(sharp.centers, walls.means, atol=1e-6)
         np.testing.assert_allclose(np.ravel(sharp.opacities) / 255, 0.25, atol=0.01)
-        is_sofa, own = np.asarray(walls.features)[:, 1] > 0.5, np.array(sharp.rgbs)
-        polished.words.value = "sofa"
-        polished.recolor()
-        found = np.array(sharp.rgbs)
-        assert found[is_sofa].max(1).min() > 130 and found[~is_sofa].max() < 70
-        polished.words.value = ""
-        polished.layer.value = "normals"
-        polished.recolor()
-        np.testing.assert_array_equal(np.array(sharp.rgbs), painted(polished.layers, "normal"))
-        polished.layer.value = "colour"
-        polished.recolor()
-        np.testing.assert_array_equal(np.array(sharp.rgbs), own)
+        check_colours(polished, sharp)
         polished.kind.value = "Gaussians"
         polished._show()
         assert (sharp.visible, gaussians.visible) == (False, True)
-    finally:
-        polished.stop()
-    assert viewer.kind.options == ("Gaussians", "points") and viewer.scene.sharp is None
 
 
 def test_a_click_tells_the_numbers_of_the_near_wall(viewer):
