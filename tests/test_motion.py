@@ -72,6 +72,7 @@ CASES = {
         {"masks": [NOTHING] * 4 + [BLOCK] * 8},
         BLOCK,
     ),
+    "what hid the place before says nothing": ([with_block(1.0)] * 5 + [WALL] * 2, HERE, {}, BLOCK),
     "and was seen through twice only": (
         [WALL] * 2 + [HERE] * 8,
         HERE,

@@ -79,7 +79,8 @@ def test_the_field_is_that_of_the_formula_where_points_are_known_differently_wel
     errors = 0.5 * TRUE + noise * rng.normal(size=len(RAYS))
     expected = stated(errors, noise)
     assert 0.005 < rms(expected - 0.5 * TRUE) < 0.5 * rms(0.5 * TRUE)  # held back by what it is not clear of
-    np.testing.assert_allclose(found(errors, noise), expected, atol=1e-4)
+    depths = rng.uniform(0.5, 2.0, (len(RAYS), 1)).astype(np.float32)  # which are nothing to it
+    np.testing.assert_allclose(found(errors, noise, points=depths * RAYS), expected, atol=1e-4)
 
 
 @pytest.mark.parametrize("valid", [False, np.arange(len(RAYS)) == 7])
