@@ -5,42 +5,43 @@ and benchmark.json in Hydra's folder. The parts: stages, icp, sweep.
 """
 
 import os
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.config.configure import build_dataset, build_prior
 from emgs_jax.io.files import write_file, write_json
+from emgs_jax.mapping.batch import step_states
+from emgs_jax.ops.executable import calling
+from emgs_jax.ops.precision import full_precision
+from emgs_jax.ops.pytree import stack
 from emgs_jax.report.columns import Table, markdown
 from emgs_jax.report.provenance import provenance
+from emgs_jax.slam import SlamConfig, step
 
-from .benchmarks.data import load
-from .benchmarks.registration import time_icp
-from .benchmarks.stages import time_settings, time_stages
-from .benchmarks.timing import Timing, spread
+from .benchmark_icp import time_icp
 from .command import command
-
-
-def parts(config: DictConfig) -> dict[str, Callable[[], Iterable[Timing]]]:
-    """Return the benchmarks that can be chosen, by name."""
-    chosen = config.benchmark
-    turns = chosen.repetitions
-    return {
-        "stages": lambda: time_stages(load(config), turns),
-        "icp": lambda: time_icp(load(config), tuple(chosen.icp_offset), turns),
-        "sweep": lambda: time_settings(load(config), chosen.num_settings, turns),
-    }
+from .timing import Candidate, Data, Timing, called, compare, interleaved, load, spread
 
 
 def benchmark(config: DictConfig, folder: Path) -> list[Timing]:
     """Time the chosen parts and write the tables after each of them."""
-    known = parts(config)
+    chosen = config.benchmark
+    turns = chosen.repetitions
+    known = {
+        "stages": lambda: time_stages(load(config), turns),
+        "icp": lambda: time_icp(load(config), tuple(chosen.icp_offset), turns),
+        "sweep": lambda: time_settings(load(config), chosen.num_settings, turns),
+    }
     unknown = set(config.parts) - set(known)
     if unknown or not config.parts:
         raise ValueError(f"parts must be some of {', '.join(known)}; got {', '.join(sorted(unknown)) or 'none'}")
@@ -53,6 +54,44 @@ def benchmark(config: DictConfig, folder: Path) -> list[Timing]:
         write_json(folder / "benchmark.json", {"provenance": about, "timings": timings})
         write_file(folder / "benchmark.md", report(timings) + "\n")
     return timings
+
+
+def time_stages(data: Data, repetitions: int) -> list[Timing]:
+    """Every executable of a step, called with what those before it give, and the whole step."""
+    given, candidates = (data.state, data.prediction, data.camera, data.config), {}
+
+    def note(executable: Any, *arguments: Any) -> Any:
+        name = executable.__wrapped__.__name__.strip("_").replace("_", " ")
+        candidates[name] = called(full_precision(executable), *arguments)
+        return candidates[name].call()
+
+    with calling(note):
+        step(*given)
+    return interleaved("stages", candidates | {"whole step": called(step, *given)}, repetitions)
+
+
+def time_settings(data: Data, counts: Sequence[int], repetitions: int) -> Iterator[Timing]:
+    """A step of many settings: the step's own executables in turn and on all cores at once, and stacked with vmap."""
+    given, config = (data.state, data.prediction, data.camera), data.config
+    compile_seconds = called(step, *given, config).compile_seconds
+
+    def on(num_threads: int, configs: Sequence[SlamConfig]) -> Candidate:
+        def call() -> None:
+            with ThreadPoolExecutor(num_threads) as threads:
+                list(threads.map(lambda one: jax.block_until_ready(step(*given, one)), configs))
+
+        return Candidate(call, compile_seconds)
+
+    for count in counts:
+        gates = config.em.max_mahalanobis_sq * jnp.linspace(0.5, 2.0, count)
+        configs = [eqx.tree_at(lambda c: c.em.max_mahalanobis_sq, config, gate) for gate in gates]
+        stacked = stack([data.state] * count), data.prediction, data.camera, stack(configs)
+        candidates = {
+            f"{count} settings, one after the other": on(1, configs),
+            f"{count} settings, {os.cpu_count()} threads": on(os.cpu_count() or 1, configs),
+            f"{count} settings, vmap": called(step_states, *stacked),
+        }
+        yield from compare(interleaved("sweep", candidates, repetitions), next(iter(candidates)))
 
 
 def report(timings: Sequence[Timing]) -> str:
@@ -71,8 +110,7 @@ def _cells(timing: Timing) -> list[str]:
     compile_seconds = "–" if timing.compile_seconds is None else f"{timing.compile_seconds:.1f}"
     run = _text(spread([1e3 * seconds for seconds in timing.seconds]))
     faster = "; ".join(f"{_text(ratio)} × {name}" for name, ratio in ratios.items()) or "–"
-    rest = ", ".join(f"{name} {_text(value)}" for name, value in facts.items())
-    return [timing.name, compile_seconds, run, faster, rest]
+    return [timing.name, compile_seconds, run, faster, ", ".join(f"{key} {_text(fact)}" for key, fact in facts.items())]
 
 
 def _text(value: Any) -> str:
@@ -86,8 +124,7 @@ def _text(value: Any) -> str:
 def main(config: DictConfig) -> None:
     """Time, print the tables and the folder."""
     folder = Path(HydraConfig.get().runtime.output_dir)
-    timings = benchmark(config, folder)
-    print(report(timings))
+    print(report(benchmark(config, folder)))
     print(f"everything is in {folder}")
 
 

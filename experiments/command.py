@@ -1,5 +1,6 @@
 """Shared parts of the commands: Hydra, the compilation cache, and an error that is one clear line."""
 
+import argparse
 import contextlib
 import logging
 import os
@@ -10,9 +11,10 @@ import traceback
 from collections.abc import Callable, Iterator
 from functools import wraps
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any
 
 import hydra
+from hydra._internal.utils import get_args_parser
 from hydra.core.hydra_config import HydraConfig
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException, InstantiationException
@@ -21,23 +23,19 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from emgs_jax.config.configure import CONF, compose, first_of_sweep, message_of
-from emgs_jax.config.overrides import quoted, readable
+from emgs_jax.config.overrides import KEY, quoted, readable
 from emgs_jax.device.settings import check_platforms, leave_memory_to_torch, use_compilation_cache
 from emgs_jax.io.files import check_writable, owned
 
-from .console import speak_on
+from .console import Console, speak_on
 from .interrupt import clear_interrupt
 from .keys import check_keys
 
-OPTIONS_WITH_A_VALUE = {
-    *("--cfg", "-c", "--package", "-p", "--info", "-i", "--config-path", "-cp", "--config-name", "-cn"),
-    "--experimental-rerun",
-}
-CONFIG_DIR = "--config-dir", "-cd"
 RUN = "config"  # conf/config.yaml, whose help lists every choice, by Hydra
 # Libraries that log at INFO which accelerators and threads are not there. A level of the logger "jax" that is set
 # before JAX is imported becomes the level of jaxlib, too, which then logs an error for each executable from the cache.
 TALKATIVE = ("jax._src", "numexpr", "websockets")
+WRONG_INPUT = (ValueError, OSError, InstantiationException, OmegaConfBaseException)
 
 
 def command(
@@ -88,20 +86,6 @@ def leave_float32() -> None:
         print("JAX_ENABLE_X64 is set, and is of no effect here: maps are made in float32")
 
 
-class Spoken:
-    """Standard output that writes what goes there into a file, too."""
-
-    def __init__(self, console: TextIO, file: TextIO) -> None:
-        self._console, self._file = console, file
-
-    def write(self, text: str) -> int:
-        self._file.write(text)
-        return self._console.write(text)
-
-    def __getattr__(self, name: str) -> Any:
-        return getattr(self._console, name)
-
-
 @contextlib.contextmanager
 def kept_words(logging: DictConfig) -> Iterator[None]:
     """Keep what a job says, how it failed included, in the file that Hydra has for its log; without one nowhere."""
@@ -111,7 +95,7 @@ def kept_words(logging: DictConfig) -> Iterator[None]:
         return
     with open(path, "a", buffering=1, encoding="utf-8") as file:
         try:
-            with contextlib.redirect_stdout(Spoken(sys.stdout, file)):
+            with contextlib.redirect_stdout(Console(sys.stdout, file)):
                 yield
         except SystemExit as end:
             file.write(f"{end}\n")
@@ -128,68 +112,66 @@ def log_of(logging: DictConfig) -> Path | None:
 
 
 def help_of(name: str) -> str:
-    """Return the help in conf/`name`.yaml: its first comment, and its own keys and choices as they stand there."""
-    lines = (CONF / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
-    blocks: dict[str, list[str]] = {}  # key at the left margin -> its lines; "" -> the comment above all of them
-    key = ""
-    for line in lines:
-        key = found[0] if (found := re.match(r"\w+", line)) else key
-        blocks.setdefault(key, []).append(line)
-    head, (_, *defaults) = (blocks.pop(key) for key in ("", "defaults"))
-    blocks.pop("hydra", None)
-    chosen = [line.strip("- ") for line in defaults if re.match(r"  - \w+: ", line)]
-    body = [*chosen, *(line for block in blocks.values() for line in block)]
-    needed = "".join(f" {line.partition(':')[0]}=…" for line in chosen if ": ???" in line)
-    more = [f"emgs {name}{needed} --cfg job shows every key with its value."]
-    if f"  - {RUN}" in defaults:
-        more.append("Every choice and key of a run is one here too: emgs run --help")
-    parts = ["\n".join(line.removeprefix("# ") for line in head), "\n".join(body).strip(), "\n".join(more)]
-    return "\n\n".join(parts)
+    """Return the help in conf/`name`.yaml: its first comment, and its own choices and keys as they stand there."""
+    text = (CONF / f"{name}.yaml").read_text(encoding="utf-8")
+    head, text = re.sub(r"^hydra:\n(?:(?:  .*)?\n)*", "", text, flags=re.MULTILINE).split("defaults:\n")
+    own = re.sub(r"^  - (?!\w+: ).*\n", "", text, flags=re.MULTILINE)  # neither files nor what Hydra is told
+    choices = re.sub(r"^  - ", "", own, flags=re.MULTILINE)
+    needed = "".join(f" {key}=…" for key in re.findall(r"^  - (\w+): \?\?\?", own, re.MULTILINE))
+    more = f"emgs {name}{needed} --cfg job shows every key with its value."
+    if f"  - {RUN}\n" in text:
+        more += "\nEvery choice and key of a run is one here too: emgs run --help"
+    return "\n\n".join([re.sub("^# ", "", head, flags=re.MULTILINE).strip(), choices.strip(), more])
+
+
+def words_of(arguments: list[str]) -> argparse.Namespace:
+    """A command line as Hydra takes it apart: its options, and in `overrides` all other words."""
+    return get_args_parser().parse_intermixed_args(arguments)
 
 
 def overrides_of(arguments: list[str]) -> list[str]:
-    """The words that are no option of Hydra, such as -m, and no value of one, such as job of --cfg job."""
-    return [text for text in arguments if "=" in text and not text.startswith("-")]
+    """The words KEY=VALUE."""
+    return [word for word in words_of(arguments).overrides if "=" in word]
+
+
+def first_words(key: str, is_list: bool = False) -> Callable[[list[str]], list[str]]:
+    """Return what makes a key of the first word, or with `is_list` of all up to the first override or option."""
+
+    def rewrite(arguments: list[str]) -> list[str]:
+        count = next((n for n, word in enumerate(arguments) if word.startswith("-") or KEY.match(word)), len(arguments))
+        words = [quoted(word) for word in arguments[: count if is_list else min(count, 1)]]
+        value = f"[{','.join(words)}]" if is_list else "".join(words)
+        return [f"{key}={value}", *arguments[len(words) :]] if words else arguments
+
+    return rewrite
 
 
 def check_arguments(name: str, arguments: list[str]) -> None:
     """Raise ValueError with near names where an override names no key or option, and where a word is no override."""
-    folders = check_words(name, arguments)
+    given = words_of(arguments)
+    folder = given.config_dir
+    if folder is not None and not Path(folder).is_dir():
+        raise ValueError(f"--config-dir {folder} is no folder: give one with options such as dataset/my.yaml")
+    for word in given.overrides:
+        if "=" not in word and not word.startswith("~"):
+            raise ValueError(
+                f"{word!r} is no KEY=VALUE: put a value with spaces into quotes ('KEY=VALUE'); "
+                f"emgs {name_of(name)} --help lists the keys"
+            )
     try:
-        parsed = OverridesParser.create().parse_overrides(overrides_of(arguments))
+        parsed = OverridesParser.create().parse_overrides([word for word in given.overrides if "=" in word])
     except HydraException as error:
         raise ValueError(f"{str(error).splitlines()[0]}: write each as KEY=VALUE, in quotes: 'KEY=VALUE'") from error
     # Of Hydra's own keys one has options of the user in it: what emgs tune has found.
     own = [o for o in parsed if not o.key_or_group.startswith("hydra") or o.key_or_group == "hydra.searchpath"]
     for override in parsed:
-        folder = str(override.value())
-        if override.key_or_group == "hydra.run.dir" and "$" not in folder:  # Hydra tells it by a traceback
-            check_writable(Path(folder), f"hydra.run.dir={folder}")
+        run = str(override.value())
+        if override.key_or_group == "hydra.run.dir" and "$" not in run:  # Hydra tells it by a traceback
+            check_writable(Path(run), f"hydra.run.dir={run}")
     overrides = [first_of_sweep(override) for override in own]
-    if folders and not any(o.key_or_group == "hydra.searchpath" for o in own):
-        overrides.append(f"hydra.searchpath=[{','.join(quoted(f'file://{Path(f).resolve()}') for f in folders)}]")
+    if folder is not None and not any(o.key_or_group == "hydra.searchpath" for o in own):
+        overrides.append(f"hydra.searchpath=[{quoted(f'file://{Path(folder).resolve()}')}]")
     compose(*overrides, name=name)
-
-
-def check_words(name: str, arguments: list[str]) -> list[str]:
-    """The folders of --config-dir; raises ValueError where a word is neither an override nor an option or its value."""
-    folders, rest = [], [*arguments]
-    while rest:
-        word, rest = rest[0], rest[1:]
-        option, has_value, value = word.partition("=")
-        if option in CONFIG_DIR:
-            value, rest = (value, rest) if has_value else (rest[0] if rest else "", rest[1:])
-            if not Path(value).is_dir():
-                raise ValueError(f"{option} {value} is no folder: give one with options such as dataset/my.yaml")
-            folders.append(value)
-        elif option in OPTIONS_WITH_A_VALUE and not has_value:
-            rest = rest[1:]
-        elif not has_value and not word.startswith(("-", "~")):
-            raise ValueError(
-                f"{word!r} is no KEY=VALUE: put a value with spaces into quotes ('KEY=VALUE'); "
-                f"emgs {name_of(name)} --help lists the keys"
-            )
-    return folders
 
 
 def name_of(name: str) -> str:
@@ -229,7 +211,7 @@ def nothing_left() -> Iterator[None]:
     is_new = hydra.mode != RunMode.MULTIRUN and is_bare() and not log.stat().st_size
     try:
         yield
-    except (ValueError, OSError, InstantiationException, OmegaConfBaseException):
+    except WRONG_INPUT:
         with contextlib.suppress(OSError, ValueError), owned(folder):
             if is_new and is_bare():
                 shutil.rmtree(folder / ".hydra", ignore_errors=True)
@@ -248,7 +230,7 @@ def clear_errors() -> Iterator[None]:
     """
     try:
         yield
-    except (ValueError, OSError, InstantiationException, OmegaConfBaseException) as error:
+    except WRONG_INPUT as error:
         is_multirun = HydraConfig.initialized() and HydraConfig.get().mode == RunMode.MULTIRUN
         if is_multirun or os.environ.get("HYDRA_FULL_ERROR") == "1":
             raise

@@ -1,26 +1,28 @@
-"""What the console can show, and whether there still is one."""
+"""What the console can show, whether there still is one, and a copy of what it is told."""
 
 import io
 import os
 import sys
-from typing import Any
+from typing import Any, TextIO
 
 
-class Heard:
+class Console:
     """A console for as long as someone reads it: when a reader such as `head` has gone, the rest goes nowhere.
 
-    A long run would end there with its work undone.
+    A long run would end there with its work undone. What is written goes into `file`, too.
     """
 
-    def __init__(self, console: io.TextIOWrapper) -> None:
-        self._console = console
+    def __init__(self, console: Any, file: TextIO | None = None) -> None:
+        self._console, self._file = console, file
 
     def write(self, text: str) -> int:
+        if self._file is not None:
+            self._file.write(text)
         try:
-            return self._console.write(text)
+            self._console.write(text)
         except BrokenPipeError:
             self._leave()
-            return len(text)
+        return len(text)
 
     def flush(self) -> None:
         try:
@@ -43,4 +45,4 @@ def speak_on() -> None:
         stream = getattr(sys, name)
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
-            setattr(sys, name, Heard(stream))
+            setattr(sys, name, Console(stream))

@@ -8,8 +8,8 @@ import copy
 import json
 import statistics
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import reduce
 from pathlib import Path
 from typing import Any
@@ -48,19 +48,21 @@ def read_effects(folder: str | Path, repetitions: Sequence[str]) -> list[Effect]
     paths = sorted(Path(folder).rglob("sweep.json"))
     if not paths:
         raise ValueError(f"there is no sweep.json below {folder}: make some with experiments.sweep -m prior.seed=0,1,2")
-    groups: dict[tuple[str, str], list[tuple]] = defaultdict(list)
+    groups: dict[tuple[str, str], dict[tuple, Effect]] = defaultdict(dict)
     repeated: dict[tuple[str, str], Path] = {}
     for path in paths:
         sweep = read_sweep(path)
-        other = repeated.setdefault((_described(sweep), _identity(sweep, ())), path)
+        title = _described(sweep)
+        other = repeated.setdefault((title, _identity(sweep, ())), path)
         if other != path:
             raise ValueError(f"{path} is the same sweep as {other}, and would count as one more: move one of them away")
-        groups[_described(sweep), _identity(sweep, repetitions)] += _differences(sweep, path)
-    titles = [title for title, _ in groups]
-    effects = []
+        _add(groups[title, _identity(sweep, repetitions)], title, sweep, path)
+    titles, effects = [title for title, _ in groups], []
     for number, ((title, _), found) in enumerate(groups.items()):
-        is_twice = titles.count(title) > 1  # the same data with another config, which no table must mix
-        effects += _grouped(f"{title}, config {number}" if is_twice else title, found)
+        if titles.count(title) > 1:  # the same data with another config, which no table must mix
+            title = f"{title}, config {number}"
+        ordered = sorted(found.values(), key=lambda effect: effect.key is not None)  # the config itself first
+        effects += [replace(effect, data=title) for effect in ordered]
     return effects
 
 
@@ -80,38 +82,24 @@ def _identity(sweep: Mapping[str, Any], repetitions: Sequence[str]) -> str:
     return json.dumps([code, config], sort_keys=True)
 
 
-def _differences(sweep: Mapping[str, Any], path: Path) -> Iterator[tuple[str | None, Any, Any, dict[str, float]]]:
-    """(key, value, own value, differences) of every setting that has one changed value, and of the config itself."""
+def _add(effects: dict[tuple, Effect], title: str, sweep: Mapping[str, Any], path: Path) -> None:
+    """Add the metrics of a sweep's own config, and what differs from them in every setting with one changed value."""
     config, settings = sweep["provenance"]["config"], sweep["settings"]
-    own = {key: _plain(reduce(dict.get, key.split("."), config)) for key in settings[0]["setting"]}
+    found = {key: reduce(dict.get, key.split("."), config) for key in settings[0]["setting"]}
+    # JSON has no infinity: a setting says it in words, a config has null.
+    own = {key: "inf" if value is None else value for key, value in found.items()}
     base = next((row["metrics"] for row in settings if row["setting"] == own), None)
     if base is None:
         raise ValueError(f"{path} lacks its own config's values {own}: add them to the axes, or grid=one_at_a_time")
     for row in settings:
         changed = [key for key, value in row["setting"].items() if value != own[key]]
-        names = [name for name in base if _is_number(base[name]) and _is_number(row["metrics"].get(name))]
-        if not changed:
-            yield None, None, None, {name: base[name] for name in names}
-        elif len(changed) == 1:
-            difference = {name: row["metrics"][name] - base[name] for name in names}
-            yield changed[0], row["setting"][changed[0]], own[changed[0]], difference
-
-
-def _is_number(value: Any) -> bool:
-    return isinstance(value, int | float)
-
-
-def _plain(value: Any) -> Any:
-    return "inf" if value is None else value  # JSON has no infinity: a setting says it in words, a config has null
-
-
-def _grouped(data: str, found: Iterable[tuple[str | None, Any, Any, dict[str, float]]]) -> Iterator[Effect]:
-    effects: dict[tuple, Effect] = {}
-    for key, value, own, metrics in found:
-        effect = effects.setdefault((key, value), Effect(data, key, value, own, defaultdict(list)))
-        for name, number in metrics.items():
-            effect.metrics[name].append(number)
-    yield from sorted(effects.values(), key=lambda effect: effect.key is not None)  # the config itself first
+        if len(changed) > 1:
+            continue
+        key, value, before = (changed[0], row["setting"][changed[0]], own[changed[0]]) if changed else (None,) * 3
+        effect = effects.setdefault((key, value), Effect(title, key, value, before, defaultdict(list)))
+        for name, number in row["metrics"].items():
+            if isinstance(number, int | float) and isinstance(base.get(name), int | float):
+                effect.metrics[name].append(number - base[name] if changed else number)
 
 
 def spread(numbers: Sequence[float], factor: float, digits: int, is_difference: bool) -> str:
@@ -125,8 +113,6 @@ def spread(numbers: Sequence[float], factor: float, digits: int, is_difference: 
 
 def columns(alignment: str) -> list[Column]:
     """`MAIN` as the sweep's protocol aligns, or with the metrics after an SE(3) alignment in their place."""
-    if alignment not in ("protocol", "se3"):
-        raise ValueError(f"align must be protocol or se3, got {alignment!r}")
     if alignment == "protocol":
         return list(MAIN)
     names = {"trajectory/ate_sim3_m": "trajectory/ate_se3_m"}

@@ -14,8 +14,7 @@ from emgs_jax.report.export import IMAGE_FORMATS, ExportConfig, export, find_fac
 from emgs_jax.report.finished_run import FinishedRun, read_run
 from emgs_jax.report.run_images import images_of
 
-from .command import command
-from .report import positional
+from .command import command, first_words
 
 
 def export_run(config: DictConfig) -> list[Path]:
@@ -59,7 +58,7 @@ def at_original_size(run: FinishedRun) -> tuple[FinishedRun, ReadableFrames]:
     return replace(run, camera=Camera((fx, fy), (cx, cy), *dataset.size)), dataset
 
 
-@command("export", positional)
+@command("export", first_words("folder"))
 def main(config: DictConfig) -> None:
     """Write, and say where."""
     for path in export_run(config):

@@ -2,15 +2,13 @@
 
 import itertools
 import math
-import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import jax
 from omegaconf import DictConfig, OmegaConf
 
-from emgs_jax.config.configure import build, near
+from emgs_jax.config.configure import build, keys_of, near
 from emgs_jax.mapping.batch import programs
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.slam import SlamConfig
@@ -53,27 +51,9 @@ def read_axes(config: DictConfig) -> dict[str, list[Value]]:
 
 
 def stage_keys(config: DictConfig) -> list[str]:
-    """Dotted keys of the values of all stages, sorted."""
-    return sorted(set(_leaf_keys(OmegaConf.to_container(config, resolve=False), "slam")))
-
-
-def _leaf_keys(root: dict[str, Any], path: str) -> Iterator[str]:
-    """Dotted keys of the values below `path`; a whole node that is only referred to counts where it stands."""
-    node = _at(root, path)
-    for name, value in node.items():
-        reference = re.fullmatch(r"\$\{([\w.]+)\}", value) if isinstance(value, str) else None
-        if reference and isinstance(_at(root, reference[1]), dict):
-            yield from _leaf_keys(root, reference[1])
-        elif isinstance(value, dict):
-            yield from _leaf_keys(root, f"{path}.{name}")
-        elif not name.startswith("_"):
-            yield f"{path}.{name}"
-
-
-def _at(root: dict[str, Any], path: str) -> Any:
-    for name in path.split("."):
-        root = root[name]
-    return root
+    """Dotted keys of the values of all stages and of the rendering that they share, sorted."""
+    keys = (key for key in keys_of(config) if key.startswith(("slam.", "render.")) and "._" not in key)
+    return sorted(key for key in keys if not isinstance(OmegaConf.select(config, key), DictConfig))
 
 
 def _advice(key: str, known: list[str]) -> str:

@@ -7,8 +7,6 @@ from typing import Any, NamedTuple
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import CONF
-from emgs_jax.config.values import Declared, check_value
-from emgs_jax.ops.ranges import Range
 
 
 class Kind(NamedTuple):
@@ -18,30 +16,31 @@ class Kind(NamedTuple):
     fits: Callable[[Any], bool]
 
 
-def whole(low: int, or_null: bool = False) -> Kind:
-    """A whole number from `low` on."""
-    words = f"a whole number from {low} on{' or null' * or_null}"
-    return Kind(words, lambda value: (or_null and value is None) or _is_whole(value, low))
+def whole(low: int, high: float = math.inf, or_null: bool = False) -> Kind:
+    """A whole number from `low` to `high`."""
+    end = "on" if high == math.inf else f"to {high}"
+    fits = lambda value: (or_null and value is None) or (_is(value, int) and low <= value <= high)  # noqa: E731
+    return Kind(f"a whole number from {low} {end}{' or null' * or_null}", fits)
 
 
-def ranged(low: float, high: float, kind: type = float, or_null: bool = False) -> Declared:
-    """A number from `low` to `high`."""
-    return Declared(frozenset({kind, type(None)} if or_null else {kind}), range=Range(low, high))
+def number(low: float, high: float) -> Kind:
+    """A number from `low` to `high`; nan is none."""
+    return Kind(f"a number from {low} to {high}", lambda value: _is(value, int | float) and low <= value <= high)
 
 
-def some(words: str, fits: Callable[[Any], bool]) -> Kind:
-    """A list, which may be empty."""
-    return Kind(f"a list of {words}", lambda value: _is_list(value) and all(map(fits, value)))
+def one_of(*values: Any) -> Kind:
+    """One of these, of the same type: true is not 1."""
+    allowed = [(type(value), value) for value in values]
+    return Kind(f"one of {', '.join(map(str, values))}", lambda value: (type(value), value) in allowed)
 
 
-def many(words: str, fits: Callable[[Any], bool]) -> Kind:
-    """A list of one or more."""
-    kind = some(words, fits)
-    return Kind(kind.words, lambda value: kind.fits(value) and len(value) > 0)
+def some(words: str, fits: Callable[[Any], bool], least: int = 1) -> Kind:
+    """A list of `least` or more."""
+    return Kind(f"a list of {words}", lambda value: _is_list(value) and len(value) >= least and all(map(fits, value)))
 
 
-def _is_whole(value: Any, low: int) -> bool:
-    return isinstance(value, int) and not isinstance(value, bool) and value >= low
+def _is(value: Any, kind: Any) -> bool:
+    return isinstance(value, kind) and not isinstance(value, bool)
 
 
 def _is_list(value: Any) -> bool:
@@ -52,65 +51,59 @@ def _is_text(value: Any) -> bool:
     return isinstance(value, str) and bool(value.strip())
 
 
-def _is_change(value: Any) -> bool:
-    return _is_text(value) and "=" in value
+def _is_offset(value: Any) -> bool:
+    return _is_list(value) and len(value) == 2 and all(_is(one, int | float) and math.isfinite(one) for one in value)
 
 
-TEXT = Kind("text", _is_text)
-COUNTS = many("whole numbers from 1 on", lambda value: _is_whole(value, 1))
-OFFSET = Kind(
-    "[m,rad]",
-    lambda value: (
-        _is_list(value) and len(value) == 2 and all(isinstance(v, int | float) and math.isfinite(v) for v in value)
-    ),
-)
-SEEDS = many("whole numbers", lambda value: _is_whole(value, 0))
-NAMES = many("names", _is_text)
-AT_ONCE = {"at_once": whole(1, or_null=True)}
-KEYS: dict[str, dict[str, Kind | Declared]] = {
-    "sweep": AT_ONCE | {"chunk": whole(1)},
-    "tune": AT_ONCE
-    | dict.fromkeys(("trials", "chunk", "best"), whole(1))
-    | {"startup": whole(0), "search_seed": whole(0)},
+def _is_once(values: Any) -> bool:
+    return SEEDS.fits(values) and len(set(values)) == len(values)
+
+
+TEXT, COUNT = Kind("text", _is_text), whole(1)
+SEEDS, NAMES = some("whole numbers", lambda value: _is(value, int) and value >= 0), some("names", _is_text)
+AT_ONCE = {"at_once": whole(1, or_null=True), "chunk": COUNT}
+KEYS: dict[str, dict[str, Kind]] = {
+    "sweep": AT_ONCE,
+    "tune": AT_ONCE | {"trials": COUNT, "best": COUNT, "startup": whole(0), "search_seed": whole(0)},
     "evaluate": {
-        "seeds": Kind(f"{SEEDS.words}, each once", lambda value: SEEDS.fits(value) and len(set(value)) == len(value)),
-        "overrides": some("KEY=VALUE", _is_change),
+        "seeds": Kind(f"{SEEDS.words}, each once", _is_once),
+        "overrides": some("KEY=VALUE", lambda value: _is_text(value) and "=" in value, least=0),
         "variants": Kind(
             "NAME: {KEY: VALUE}, one or more", lambda value: isinstance(value, Mapping) and len(value) > 0
         ),
         "shard": TEXT,
     },
-    "export": {"formats": some("names", _is_text)},  # the others are those of ExportConfig
-    "effects": {"repetitions": some("keys", _is_text)},
+    "export": {"formats": some("names", _is_text, least=0)},  # the others are those of ExportConfig
+    "effects": {"repetitions": some("keys", _is_text, least=0), "align": one_of("protocol", "se3")},
     "embed": {"classes": NAMES},
     "segment": {
         "map": Kind("a folder or a list of folders", lambda value: _is_text(value) or NAMES.fits(value)),
-        "alignment": Declared(frozenset({str}), choices=("trajectory", "points")),
-        "with_scale": Declared(frozenset({bool})),
-        "icp_distance_m": ranged(1e-6, 1e6),
-        "icp_max_steps": ranged(0, 10000, int),
-        "voxel_m": ranged(1e-6, 1e6),
-        "max_depth_m": ranged(1e-6, math.inf),
+        "alignment": one_of("trajectory", "points"),
+        "with_scale": one_of(True, False),
+        "icp_distance_m": number(1e-6, 1000000),
+        "icp_max_steps": whole(0, 10000),
+        "voxel_m": number(1e-6, 1000000),
+        "max_depth_m": number(1e-6, math.inf),
     },
     "query": {
-        "margin": ranged(0, 2),
-        "min_cosine": ranged(-1, 1),
-        "num_views": ranged(1, 100, int),
-        "max_words": ranged(1, 1000, int),
-        "frame": ranged(0, 10**9, int, or_null=True),
+        "margin": number(0, 2),
+        "min_cosine": number(-1, 1),
+        "num_views": whole(1, 100),
+        "max_words": whole(1, 1000),
+        "frame": whole(0, or_null=True),
     },
     "score": {
-        "max_time_difference": ranged(0, 1e6),
-        "min_associated_percent": ranged(0, 100),
-        "min_matched_percent": ranged(0, 100),
-        "normal_neighbours": ranged(3, 1000, int),
+        "max_time_difference": number(0, 1000000),
+        "min_associated_percent": number(0, 100),
+        "min_matched_percent": number(0, 100),
+        "normal_neighbours": whole(3, 1000),
     },
-    "view": {"port": ranged(1, 65535, int)},
+    "view": {"port": whole(1, 65535)},
     "benchmark": {
         "parts": NAMES,
-        "benchmark.repetitions": whole(1),
-        "benchmark.num_settings": COUNTS,
-        "benchmark.icp_offset": OFFSET,
+        "benchmark.repetitions": COUNT,
+        "benchmark.num_settings": some("whole numbers from 1 on", COUNT.fits),
+        "benchmark.icp_offset": Kind("[m,rad]", _is_offset),
     },
 }
 FOLDERS = ("out", "folder", "map", "root")  # of commands, where they have to be given
@@ -122,10 +115,7 @@ def check_keys(name: str, config: DictConfig) -> None:
     kinds = {key: TEXT for key in FOLDERS if OmegaConf.is_missing(own, key)} | KEYS.get(name, {})
     for key, kind in kinds.items():
         value = OmegaConf.select(config, key)
-        if OmegaConf.is_config(value):
-            value = OmegaConf.to_container(value)
-        if isinstance(kind, Declared):
-            check_value(key, value, kind)
-        elif not kind.fits(value) and not (value is None and OmegaConf.is_missing(config, key)):
+        value = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
+        if not kind.fits(value) and not (value is None and OmegaConf.is_missing(config, key)):
             shown = "null" if value is None else repr(value)
             raise ValueError(f"{key} must be {kind.words}, got {shown}: give such a value")

@@ -5,12 +5,11 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from emgs_jax.config.overrides import KEY, quoted
 from emgs_jax.report.finished_run import REPORT_FILE
 from emgs_jax.report.merging import merge
 from emgs_jax.report.printout import last_words, metrics_table
 
-from .command import command
+from .command import command, first_words
 
 
 def merge_runs(config: DictConfig) -> tuple[dict[str, Any], list[str]]:
@@ -25,14 +24,7 @@ def merge_runs(config: DictConfig) -> tuple[dict[str, Any], list[str]]:
     return merge(folders, out, config.truth)
 
 
-def positionals(arguments: list[str]) -> list[str]:
-    """The first words that are no overrides are the folders."""
-    count = next((n for n, word in enumerate(arguments) if word.startswith("-") or KEY.match(word)), len(arguments))
-    folders = ",".join(map(quoted, arguments[:count]))
-    return [f"folders=[{folders}]", *arguments[count:]] if count else arguments
-
-
-@command("merge", positionals)
+@command("merge", first_words("folders", is_list=True))
 def main(config: DictConfig) -> None:
     """Merge, and say where it is."""
     metrics, notes = merge_runs(config)

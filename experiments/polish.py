@@ -13,8 +13,7 @@ from emgs_jax.report.printout import polish_lines
 from emgs_jax.report.run_images import images_of
 from emgs_jax.report.run_splats import polish
 
-from .command import command
-from .report import positional
+from .command import command, first_words
 
 
 def polish_run(config: DictConfig) -> dict[str, Any]:
@@ -33,7 +32,7 @@ def polish_run(config: DictConfig) -> dict[str, Any]:
     return found
 
 
-@command("polish", positional)
+@command("polish", first_words("folder"))
 def main(config: DictConfig) -> None:
     """Polish, and say what it has changed on the frames that were held out."""
     print("\n".join(polish_lines(polish_run(config))))

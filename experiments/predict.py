@@ -6,7 +6,8 @@ visits of a place. Without that this script needs no JAX, unless the prior does,
 PyTorch: each may have its own environment.
 """
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable
+from functools import partial
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -15,7 +16,7 @@ from tqdm import tqdm
 from emgs_jax.config.configure import build_dataset, build_prior, graph_config
 from emgs_jax.data.base import Dataset
 from emgs_jax.io.files import owned
-from emgs_jax.prior.base import Prior, Window
+from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.recorded_visits import places_seen_twice, record_visits
 
@@ -26,14 +27,10 @@ def predict(config: DictConfig) -> Path:
     """Record the predictions of `config` into `config.out`."""
     dataset = build_dataset(config)
     prior = build_prior(config, dataset)
-
-    def progress(windows: Sequence[Window]) -> Iterable[Window]:
-        return tqdm(windows, unit="inference", desc=prior.provenance.name)
-
     folder = Path(config.out)
     with owned(folder):
         _check_folder(folder)
-        record(prior, dataset, config.slam.window_size, folder, progress)
+        record(prior, dataset, config.slam.window_size, folder, _bar("inference", prior.provenance.name))
         if config.graph:
             _record_visits(prior, dataset, config, folder)
     size = sum(path.stat().st_size for path in folder.iterdir()) / 2**20
@@ -57,24 +54,14 @@ def _record_visits(prior: Prior, dataset: Dataset, config: DictConfig, folder: P
     end, size = graph_config(config), config.slam.window_size
     if not end.prior_query.is_used:
         return
-    pairs = places_seen_twice(
-        Recorded(folder),
-        dataset,
-        size,
-        end.place_recognition,
-        end.verification.alignment,
-        lambda windows: tqdm(windows, unit="frame", desc="places seen twice"),
-    )
-    count = record_visits(
-        prior,
-        dataset,
-        size,
-        folder,
-        pairs,
-        end.prior_query.spacing,
-        lambda some: tqdm(some, unit="pair", desc="visits"),
-    )
+    how = end.place_recognition, end.verification.alignment, _bar("frame", "places seen twice")
+    pairs = places_seen_twice(Recorded(folder), dataset, size, *how)
+    count = record_visits(prior, dataset, size, folder, pairs, end.prior_query.spacing, _bar("pair", "visits"))
     print(f"{count} windows with both visits of a place, for loops")
+
+
+def _bar(unit: str, words: str) -> Callable[[Iterable], Iterable]:
+    return partial(tqdm, unit=unit, desc=words)
 
 
 @command("predict")

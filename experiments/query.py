@@ -34,14 +34,12 @@ from emgs_jax.report.query_pictures import (
 from emgs_jax.report.vocabulary import Vocabulary, feature_model, vocabulary, words_of
 
 from .command import command
-from .keys import check_keys
 
 UNLIKE = ("object", "things", "stuff", "texture")  # LERF's canonical phrases: what anything is
 
 
 def query(config: DictConfig) -> dict[str, Any]:
     """Ask `config.map` and write the answer; returns what query.json says."""
-    check_keys("query", config)
     instances = build(config, "instances")
     words = asked(config)
     run = read_run(Path(config.map))

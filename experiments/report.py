@@ -4,13 +4,12 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from emgs_jax.config.overrides import KEY, quoted
 from emgs_jax.io.files import check_writable
 from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.page import write_report
 from emgs_jax.report.run_images import images_of
 
-from .command import command
+from .command import command, first_words
 
 
 def report(folder: Path) -> Path:
@@ -23,13 +22,7 @@ def report(folder: Path) -> Path:
     return path
 
 
-def positional(arguments: list[str]) -> list[str]:
-    """A first word that is no override is the folder."""
-    is_folder = bool(arguments) and not arguments[0].startswith("-") and KEY.match(arguments[0]) is None
-    return [f"folder={quoted(arguments[0])}", *arguments[1:]] if is_folder else arguments
-
-
-@command("report", positional)
+@command("report", first_words("folder"))
 def main(config: DictConfig) -> None:
     """Write the page, and say where it is."""
     report(Path(str(config.folder)))

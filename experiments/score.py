@@ -13,8 +13,8 @@ from omegaconf import DictConfig, OmegaConf
 from emgs_jax.config.configure import build, build_dataset
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.timestamps import in_seconds
-from emgs_jax.evaluation.clouds import PointCloud, read_cloud
-from emgs_jax.evaluation.reconstruction import EvaluationConfig, compare_clouds
+from emgs_jax.evaluation.clouds import read_cloud
+from emgs_jax.evaluation.reconstruction import compare_clouds
 from emgs_jax.evaluation.trajectory import associate, check_conventions, trajectory_metrics
 from emgs_jax.io.ply_reader import num_faces
 from emgs_jax.io.trajectory import load_trajectory_tum
@@ -25,14 +25,12 @@ from emgs_jax.report.results import METRICS_FILE, estimates_of, is_finished, res
 from emgs_jax.report.tables import average, full_table
 
 from .command import command
-from .keys import check_keys
 
 Metrics = dict[str, Any]
 
 
 def score(config: DictConfig) -> tuple[Metrics, Path]:
     """Compare the trajectory and the cloud of `config` with its data set; returns the metrics and their file."""
-    check_keys("score", config)
     evaluation = build(config, "evaluation")
     dataset = build_dataset(config)
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
@@ -44,7 +42,7 @@ def score(config: DictConfig) -> tuple[Metrics, Path]:
     )
     metrics = trajectory_metrics(poses, truth) | counts
     if cloud is not None:
-        metrics |= compare(cloud, (poses, truth), dataset, evaluation)
+        metrics |= compare_clouds(cloud, true_cloud(dataset, evaluation), (poses, truth), evaluation)
     block = provenance(settings, dataset, Provenance(config.method, {}, config.simulated))
     metrics["provenance"] = block | {"prior": None, "method": config.method}
     folder.mkdir(parents=True, exist_ok=True)
@@ -64,8 +62,8 @@ def matched_poses(
         raise FileNotFoundError(f"trajectory={path} is no file: give a file with `timestamp tx ty tz qx qy qz qw`")
     times, poses = load_trajectory_tum(path)
     order = np.argsort(times, kind="stable")  # motions are from one pose to the next in time
-    times, poses = times[order], poses[order]
-    times = in_seconds(times)  # ORB-SLAM3 and others write the nanoseconds of EuRoC's clock into this format
+    # ORB-SLAM3 and others write the nanoseconds of EuRoC's clock into this format.
+    times, poses = in_seconds(times[order]), poses[order]
     what = f"{dataset.name} {dataset.sequence}"
     frames = (dataset[row] for row in range(len(dataset)))
     known = [(frame.timestamp, frame.T_world_camera) for frame in frames if frame.T_world_camera is not None]
@@ -89,14 +87,12 @@ def matched_poses(
 
 
 def _check_twice(times: np.ndarray, poses: np.ndarray, path: str) -> None:
-    """ValueError where two poses have one time: it is open which of them a score is about."""
-    order = np.argsort(times, kind="stable")
-    twice = np.flatnonzero(np.diff(times[order]) == 0)
-    differ = [row for row in twice if not np.array_equal(poses[order[row]], poses[order[row + 1]])]
-    if differ:
+    """ValueError where two poses have one of the ascending times: it is open which of them a score is about."""
+    differ = times[1:][(np.diff(times) == 0) & (poses[1:] != poses[:-1]).any((1, 2))]
+    if len(differ):
         raise ValueError(
-            f"{path} has {len(differ)} poses at times at which it has another one, the first at "
-            f"{times[order[differ[0]]]:.6f} s: keep one path, with all digits of its times"
+            f"{path} has {len(differ)} poses at times at which it has another one, the first at {differ[0]:.6f} s: "
+            "keep one path, with all digits of its times"
         )
 
 
@@ -113,13 +109,6 @@ def coverage(metrics: Metrics, min_percent: float) -> str:
         "selected or lost many, and its numbers must not be set beside ours: choose its frames (dataset.start, stop, "
         "stride), and check the timestamps (max_time_difference)"
     )
-
-
-def compare(
-    cloud: PointCloud, poses: tuple[np.ndarray, np.ndarray], dataset: ReadableFrames, evaluation: EvaluationConfig
-) -> Metrics:
-    """Reconstruction metrics against the true cloud of all frames."""
-    return compare_clouds(cloud, true_cloud(dataset, evaluation), poses, evaluation)
 
 
 def _span(times: np.ndarray) -> str:

@@ -4,9 +4,11 @@ Every trial is drawn with a seed of its own from the trials before it, and writt
 asks what one asks that nobody stopped.
 """
 
+import contextlib
 import math
 import warnings
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -26,26 +28,12 @@ if TYPE_CHECKING:
 
 DIRECTIONS = ("minimize", "maximize")
 _EXAMPLE = "'space={slam.em.max_log_gap:{low:2,high:32,log:true}}'"
-
-
 Space = Mapping[str, Any]  # key -> a distribution of Optuna
 
 
 def ends_of(allowed: Any) -> tuple[Value, ...]:
     """Two values of a distribution that tell whether all of them share a program."""
-    return allowed.choices[:2] if _is_choice(allowed) else (allowed.low, allowed.high)
-
-
-def allows(allowed: Any, value: Value) -> bool:
-    """Test whether a distribution may draw a value; true is not 1."""
-    if _is_choice(allowed):
-        return any(type(value) is type(one) and value == one for one in allowed.choices)
-    kinds = int if isinstance(allowed.low, int) else int | float
-    return isinstance(value, kinds) and not isinstance(value, bool) and allowed.low <= value <= allowed.high
-
-
-def _is_choice(allowed: Any) -> bool:
-    return hasattr(allowed, "choices")
+    return allowed.choices[:2] if hasattr(allowed, "choices") else (allowed.low, allowed.high)
 
 
 def read_space(config: DictConfig) -> Space:
@@ -91,9 +79,7 @@ def _read(key: str, given: Any, field: Declared) -> Any:
 def own_setting(config: DictConfig, space: Space) -> dict[str, Any]:
     """The config's own values of what is searched, as a trial would have them."""
     found = {key: OmegaConf.select(config, key) for key in space}
-    numbers = {
-        key for key, allowed in space.items() if isinstance(ends_of(allowed)[0], float) and not _is_choice(allowed)
-    }
+    numbers = {key for key, allowed in space.items() if isinstance(getattr(allowed, "low", None), float)}
     return {key: float(value) if key in numbers and value is not None else value for key, value in found.items()}
 
 
@@ -160,13 +146,13 @@ def ask(
         startup: trials before the search learns.
     """
     optuna = _optuna()
-    running = optuna.trial.TrialState.RUNNING
+    new = partial(optuna.trial.create_trial, state=(running := optuna.trial.TrialState.RUNNING))
+    if not study.trials:
+        with contextlib.suppress(ValueError):  # they are not in the space
+            study.add_trial(new(params=dict(own), distributions=dict(space)))
     while (number := len(study.trials)) < end:
-        if number == 0 and all(allows(allowed, own[key]) for key, allowed in space.items()):
-            params = {key: own[key] for key in space}
-        else:
-            params = _drawn(optuna, study, space, [seed, number], startup)
-        study.add_trial(optuna.trial.create_trial(state=running, params=params, distributions=dict(space)))
+        params = _drawn(optuna, study, space, [seed, number], startup)
+        study.add_trial(new(params=params, distributions=dict(space)))
     return list(study.get_trials(states=(running,)))
 
 

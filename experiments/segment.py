@@ -18,14 +18,12 @@ from emgs_jax.report.segmentation_table import Placement, SceneResult, score_sce
 from emgs_jax.report.vocabulary import feature_model, vocabulary
 
 from .command import command
-from .keys import check_keys
 
 FRAMES = "frames"  # the word that takes the labels of the data set's own frames for truth
 
 
 def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
     """Score the maps of `config` and write file and table; returns both."""
-    check_keys("segment", config)
     protocol = build(config, "protocol", _convert_="all")
     how = Placement(config.alignment, config.with_scale, config.icp_distance_m, config.icp_max_steps)
     runs = [read_run(Path(str(folder))) for folder in (config.map if _is_list(config.map) else [config.map])]

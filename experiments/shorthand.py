@@ -6,7 +6,7 @@ from pathlib import Path
 
 from emgs_jax.config.overrides import written
 
-from .command import CONFIG_DIR, OPTIONS_WITH_A_VALUE, overrides_of
+from .command import overrides_of, words_of
 
 NUM_PIXELS, SIDE = 320 * 240, 16  # of a frame, and what its sides are multiples of
 
@@ -17,16 +17,18 @@ def with_source(arguments: list[str]) -> list[str]:
     Raises:
         ValueError: a word is neither a key with a value, nor an option, nor a path, or there are several paths.
     """
-    paths = [row for row, word in enumerate(arguments) if _is_path(word, arguments[:row])]
+    # ~KEY takes a key away, ~/ is the home.
+    paths = [
+        word for word in words_of(arguments).overrides if "=" not in word and (word[0] != "~" or word.startswith("~/"))
+    ]
     if not paths:
         return arguments
     if len(paths) > 1:
-        words = ", ".join(arguments[row] for row in paths)
-        raise ValueError(f"{words}: give one video or folder of images, and all else as key=value")
-    path = Path(arguments[paths[0]]).expanduser()
+        raise ValueError(f"{', '.join(paths)}: give one video or folder of images, and all else as key=value")
+    path = Path(paths[0]).expanduser()
     if not path.exists():
         raise ValueError(f"{path} is no file or folder, and no key=value: emgs run --help lists the keys")
-    given = [word for row, word in enumerate(arguments) if row != paths[0]]
+    given = [word for word in arguments if word != paths[0]]
     found = implied(path, keys_of(given))
     print(f"{path}: {' '.join(found)}; keys that you give win")
     return [*found, *given]
@@ -72,9 +74,3 @@ def _size(path: Path) -> tuple[int, int]:
     if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
         return Video(path, 1).read(0).shape[1::-1]
     return first_size(listed(path)[0], path)
-
-
-def _is_path(word: str, before: Sequence[str]) -> bool:
-    """Test whether a word is neither an override (~key deletes one) nor an option or the value of one."""
-    is_other = "=" in word or word.startswith("-") or (word.startswith("~") and not word.startswith("~/"))
-    return not is_other and (not before or before[-1] not in {*OPTIONS_WITH_A_VALUE, *CONFIG_DIR})

@@ -19,7 +19,7 @@ from emgs_jax.report.sweep_page import draw, table, write_sweep_page
 
 from .command import command
 from .grid import notes, read_axes, variants
-from .together import Measured, refuse_other_maps
+from .together import Measured, refuse_other_maps, resumed
 
 
 def sweep(config: DictConfig, folder: Path, command_line: str = "") -> list[dict[str, Any]]:
@@ -55,12 +55,8 @@ def sweep(config: DictConfig, folder: Path, command_line: str = "") -> list[dict
 @command("sweep")
 def main(config: DictConfig) -> None:
     """Sweep, and say where the results are."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    try:
+    with resumed() as folder:
         sweep(config, folder, shlex.join(["emgs", "sweep", *HydraConfig.get().overrides.task]))
-    except KeyboardInterrupt:
-        print(f"what is done is in {folder}; the same command with hydra.run.dir={folder} goes on from there")
-        raise
     print(f"everything is in {folder}, report.html shows it")
 
 

@@ -25,7 +25,7 @@ from emgs_jax.report.tables import COLUMNS as ALL
 from emgs_jax.report.tables import average
 
 from .command import command
-from .evaluate import Job, evaluate, plan
+from .evaluate import evaluate, plan
 
 Settings = Mapping[str, Any]  # a resolved conf/evaluate.yaml
 COLUMNS = tuple(column._replace(digits=1) for column in ALL if not column.key.startswith(("time/", "trajectory/scale")))
@@ -155,11 +155,6 @@ def with_blocks(page: Path, blocks: Mapping[str, str]) -> str:
     return text
 
 
-def write_blocks(page: Path, blocks: Mapping[str, str]) -> None:
-    """Write a page with other text between its markers."""
-    write_file(page, with_blocks(page, blocks))
-
-
 def tables(config: Mapping[str, Any]) -> None:
     """Run what is not finished and write all tables of both pages; `config` is a resolved conf/tables.yaml."""
     pages = Path(config["page"]), Path(config["full_page"])
@@ -167,7 +162,10 @@ def tables(config: Mapping[str, Any]) -> None:
         check_writable(page.parent, str(page))
         with_blocks(page, dict.fromkeys(config["tables"], ""))
     planned = {table: list(evaluations(config, table)) for table in config["tables"]}
-    paths = {name: [_result(job) for settings in table for job in plan(settings)] for name, table in planned.items()}
+    paths = {
+        name: [job.folder / METRICS_FILE for settings in table for job in plan(settings)]
+        for name, table in planned.items()
+    }
     everything = [path for found in paths.values() for path in found]
     finished = [path for path in everything if path.is_file()]
     if len(finished) < len(everything):  # in half an hour it would be too late to learn that the code has changes
@@ -178,12 +176,9 @@ def tables(config: Mapping[str, Any]) -> None:
         raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
     revision_of(_code_of(everything))
     titles, short = config["titles"], config["short"]
-    write_blocks(pages[0], {name: short_block(found, titles, short) for name, found in paths.items()})
-    write_blocks(pages[1], {name: block(found, titles) for name, found in paths.items()})
-
-
-def _result(job: Job) -> Path:
-    return job.folder / METRICS_FILE
+    shown = {name: short_block(found, titles, short) for name, found in paths.items()}
+    for page, blocks in zip(pages, (shown, {name: block(found, titles) for name, found in paths.items()}), strict=True):
+        write_file(page, with_blocks(page, blocks))
 
 
 @command("tables")

@@ -1,5 +1,6 @@
 """Settings that are mapped and scored together on one sequence, for `sweep` and `tune`."""
 
+import contextlib
 import os
 import shutil
 from collections.abc import Iterator, Mapping, Sequence
@@ -9,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
@@ -17,7 +19,7 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
 from emgs_jax.io.files import atomic_write, remove_temporaries
 from emgs_jax.mapping.batch import finish_together, map_together, programs
-from emgs_jax.mapping.run import MappingRun, new_run
+from emgs_jax.mapping.run import new_run
 from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
 from emgs_jax.prior.recorded import Recorded, record
@@ -38,16 +40,26 @@ NOT_OF_RESULTS = (  # keys that change no number of a setting
 
 def refuse_other_maps(config: DictConfig, what: str) -> None:
     """Raise ValueError where the config asks for what settings cannot share."""
-    if config.baseline:
-        raise ValueError(f"baseline= is for run and evaluate: {what} compares settings, and no baseline has them")
-    if config.map:
-        raise ValueError(f"map= is for run and evaluate: {what} makes its own maps")
-    if config.graph:
-        raise ValueError(f"graph= is for run and evaluate: {what} steps many maps at once, and no loop closes in them")
-    if config.polish:
-        raise ValueError(f"polish= is for run and evaluate: {what} draws maps as they are")
-    if config.view:
-        raise ValueError(f"view= is for run and evaluate: {what} maps many settings at once")
+    for key, reason in {
+        "baseline": "compares settings, and no baseline has them",
+        "map": "makes its own maps",
+        "graph": "steps many maps at once, and no loop closes in them",
+        "polish": "draws maps as they are",
+        "view": "maps many settings at once",
+    }.items():
+        if config[key]:
+            raise ValueError(f"{key}= is for run and evaluate: {what} {reason}")
+
+
+@contextlib.contextmanager
+def resumed() -> Iterator[Path]:
+    """The folder of a command, of which Ctrl-C says how it is gone on with."""
+    folder = Path(HydraConfig.get().runtime.output_dir)
+    try:
+        yield folder
+    except KeyboardInterrupt:
+        print(f"what is done is in {folder}; the same command with hydra.run.dir={folder} goes on from there")
+        raise
 
 
 def shared_settings(config: DictConfig) -> dict[str, Any]:
@@ -133,16 +145,13 @@ class Measured:
         total = len(self.dataset) * num_left
         with tqdm(total=total, unit="frame", desc=self.name, disable=not chunks) as bar:
             for chunk in chunks:
-                self._results.add([one.setting for one in chunk], map_and_score(self, chunk, bar))
+                prior = self._priors[chunk[0].slam.window_size]
+                self._results.add([one.setting for one in chunk], map_and_score(self, prior, chunk, bar))
         return num_left
 
     def rows(self, settings: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         """Return a flat row for each setting that was measured: its number, its values and its metrics."""
         return self._results.rows([plain_setting(setting) for setting in settings])
-
-    def prior_of(self, chunk: Sequence[Variant]) -> Prior:
-        """The prior that is asked for settings that share a program."""
-        return self._priors[chunk[0].slam.window_size]
 
     def forget_predictions(self) -> None:
         """Remove what was recorded."""
@@ -158,15 +167,15 @@ def replayed(prior: Prior, dataset: ReadableFrames, window_size: int, folder: Pa
     return Recorded(path)
 
 
-def map_and_score(sequence: Measured, chunk: Sequence[Variant], bar: tqdm) -> list[Metrics]:
-    """Map and score some settings that share a program; the metrics of each."""
+def map_and_score(sequence: Measured, prior: Prior, chunk: Sequence[Variant], bar: tqdm) -> list[Metrics]:
+    """Map and score some settings that share a program by the answers of a prior; the metrics of each."""
     dataset, scorer = sequence.dataset, sequence.scorer
     groups = start = [new_run(dataset, variant.slam, sequence.clock) for variant in chunk]
     at_once, num_threads = side_by_side(sequence.config, len(chunk))
 
     def frames() -> Iterator[tuple[None, RawView]]:
         nonlocal groups
-        for found in map_together(start, dataset, sequence.prior_of(chunk), at_once, num_threads):
+        for found in map_together(start, dataset, prior, at_once, num_threads):
             groups, views = found
             bar.update(len(views) * len(chunk))
             yield from ((None, view) for view in views)
@@ -176,15 +185,9 @@ def map_and_score(sequence: Measured, chunk: Sequence[Variant], bar: tqdm) -> li
     runs = finish_together(groups)
     densify = [variant.densify for variant in chunk]
     metrics = score_settings(runs, raw, densify, scorer, num_threads)
-    if sequence.has_pictures:
-        for variant, run in zip(chunk, runs, strict=True):
-            _draw(picture_path(sequence.folder, variant.setting), run)
+    for variant, run in zip(chunk, runs, strict=True) if sequence.has_pictures else ():
+        centers, path = center_cloud(run), picture_path(sequence.folder, variant.setting)
+        path.parent.mkdir(exist_ok=True)
+        with atomic_write(path) as handle:
+            thumbnail(centers.points, centers.colors, np.stack(run.poses)).save(handle, "JPEG", quality=85)
     return metrics
-
-
-def _draw(path: Path, run: MappingRun) -> None:
-    """Write the map from above."""
-    centers = center_cloud(run)
-    path.parent.mkdir(exist_ok=True)
-    with atomic_write(path) as handle:
-        thumbnail(centers.points, centers.colors, np.stack(run.poses)).save(handle, "JPEG", quality=85)

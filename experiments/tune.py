@@ -26,9 +26,8 @@ from emgs_jax.report.tuning import DEFAULT, SequenceResults, draw_trials, settin
 
 from .command import command
 from .grid import variant_of
-from .keys import check_keys
 from .search import Space, ask, ends_of, front, open_study, own_setting, read_objectives, read_space, told
-from .together import Measured, refuse_other_maps
+from .together import Measured, refuse_other_maps, resumed
 
 Setting = Mapping[str, Any]
 
@@ -48,7 +47,6 @@ def tune(words: Sequence[str], folder: Path) -> list[dict[str, Any]]:
     config = compose(*words, name="tune")
     refuse_other_maps(config, "a search")
     space, objectives = read_space(config), read_objectives(config)
-    check_keys("tune", config)
     configs = {kind: _sequences(words, config, kind, space) for kind in ("tuned", "held_out")}
     _check_apart(configs["tuned"], configs["held_out"])
     own = own_setting(config, space)
@@ -220,12 +218,8 @@ def _write_best(folder: Path, best: Mapping[int, Setting], lines: Mapping[str, s
 @command("tune")
 def main(config: DictConfig) -> None:
     """Search, and say where the results are."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    try:
+    with resumed() as folder:
         tune(list(HydraConfig.get().overrides.task), folder)
-    except KeyboardInterrupt:
-        print(f"what is done is in {folder}; the same command with hydra.run.dir={folder} goes on from there")
-        raise
     print(f"everything is in {folder}")
 
 

@@ -8,18 +8,15 @@ from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.viewer import Viewer
 from emgs_jax.report.viewer_scene import shown
 
-from .command import command
-from .keys import check_keys
-from .report import positional
+from .command import command, first_words
 
 
 def view(config: DictConfig) -> Viewer:
     """Serve the run of a config."""
-    check_keys("view", config)
     return Viewer(shown(read_run(Path(str(config.folder)))), config.port)
 
 
-@command("view", positional)
+@command("view", first_words("folder"))
 def main(config: DictConfig) -> None:
     """Serve, say where, and wait."""
     viewer = view(config)

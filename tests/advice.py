@@ -1,6 +1,7 @@
 """Advice helps: a table has causes, messages, and what the messages say, which is done, after which the same works.
 
 A row is a cause, the message, and remedies, each of which is tried by itself on files that are sound but for the cause.
+Without any it is to have the files as they were.
 """
 
 import re
@@ -86,6 +87,11 @@ def fetched(file: str) -> Step:
     return lambda root, said: shutil.copy(root.parent / "sound" / file, root / file)
 
 
+def all_fetched(root: Path, said: Said) -> None:
+    shutil.rmtree(root)
+    shutil.copytree(root.parent / "sound", root)
+
+
 def resized(file: str, size: tuple[int, int]) -> Step:
     def run(root, said):
         image = cv2.imread(str(root / file), cv2.IMREAD_UNCHANGED)
@@ -115,7 +121,12 @@ def sound_files(tables: Tables) -> Callable:
 
 def each_remedy(tables: Tables) -> Callable:
     """A mark: every cause and message of the tables with every remedy."""
-    cases = [(name, *row[:2], remedy) for name, (_, _, rows) in tables.items() for row in rows for remedy in row[2:]]
+    cases = [
+        (name, *row[:2], remedy)
+        for name, (_, _, rows) in tables.items()
+        for row in rows
+        for remedy in row[2:] or [all_fetched]
+    ]
     names = [f"{name}: {message[:40]}" for name, _, message, _ in cases]
     return pytest.mark.parametrize(("name", "cause", "message", "remedy"), cases, ids=names)
 

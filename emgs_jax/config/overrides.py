@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hydra.core.override_parser.overrides_parser import OverridesParser
-from hydra.core.override_parser.types import Override
+from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 
 KEY = re.compile(r"(?:\+{1,2}|~)?[A-Za-z_][\w./@:-]*=")
@@ -98,6 +98,5 @@ def written(value: Any) -> str:
 
 
 def quoted(value: str) -> str:
-    """Text as Hydra's grammar takes it literally: only quotes, and backslashes before them, need a backslash."""
-    escaped = re.sub(r"(\\*)('|$)", lambda found: 2 * found[1] + ("\\'" if found[2] else ""), value)
-    return f"'{escaped}'"
+    """Text as Hydra's grammar takes it literally."""
+    return QuotedString(value, Quote.single).with_quotes()

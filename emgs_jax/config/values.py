@@ -11,7 +11,7 @@ import numbers
 import re
 import types
 import typing
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from hydra.utils import get_class
@@ -132,49 +132,40 @@ def field_of(config: DictConfig, key: str) -> Declared:
 
 def declared(cls: type) -> dict[str, Declared]:
     """Return the declarations of the fields of a dataclass, or of the parameters of another class, by name."""
-    return dict(_declarations(cls))
+    if not dataclasses.is_dataclass(cls):
+        parameters = inspect.signature(cls).parameters
+        return {name: _of_hint(parameter.annotation) for name, parameter in parameters.items()}
+    return {field.name: _of_field(field) for field in dataclasses.fields(cls)}
 
 
-def _declarations(cls: type) -> Iterator[tuple[str, Declared]]:
-    if dataclasses.is_dataclass(cls):
-        for field in dataclasses.fields(cls):
-            hint, about = field.type, field.metadata
-            if "choices" in about:
-                yield field.name, Declared(frozenset({str}), choices=about["choices"])
-            elif "range" in about:
-                kinds, elements = _kinds(hint)
-                known = kinds or elements  # a traced field is annotated as the array that it becomes
-                yield (
-                    field.name,
-                    Declared(kinds if known else frozenset({float}), elements, about["range"], length=_length(hint)),
-                )
-            else:
-                yield field.name, Declared(*_kinds(hint), is_node=dataclasses.is_dataclass(hint), length=_length(hint))
-        return
-    for name, parameter in inspect.signature(cls).parameters.items():
-        yield name, Declared(*_kinds(parameter.annotation), length=_length(parameter.annotation))
+def _of_field(field: dataclasses.Field) -> Declared:
+    about = field.metadata
+    if "choices" in about:
+        return Declared(frozenset({str}), choices=about["choices"])
+    found = dataclasses.replace(_of_hint(field.type), range=about.get("range"))
+    if "range" in about and not (found.kinds or found.elements):  # a traced one is annotated as the array it becomes
+        return dataclasses.replace(found, kinds=frozenset({float}))
+    return dataclasses.replace(found, is_node=found.range is None and dataclasses.is_dataclass(field.type))
 
 
-def _kinds(hint: Any) -> tuple[frozenset[type], frozenset[type]]:
+def _of_hint(hint: Any) -> Declared:
     """Plain kinds that a hint allows, and those of a list's elements; none where it allows anything else."""
-    plain, elements = set(), set()
-    for part in typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,):
+    plain, elements, lengths = set(), set(), set()
+    for part in _parts(hint):
         origin, arguments = typing.get_origin(part), typing.get_args(part)
         if part in _NAMES or part is type(None):
             plain.add(part)
         elif origin in (tuple, list, Sequence) and arguments:
-            found = [_kinds(argument) for argument in arguments if argument is not ...]
-            if any(inner or not kinds <= {int, float, str} or not kinds & {int, float} for kinds, inner in found):
-                return frozenset(), frozenset()
-            elements |= set().union(*(kinds for kinds, _ in found))
+            found = {kind for argument in arguments if argument is not ... for kind in _parts(argument)}
+            if not found <= {int, float, str} or found == {str}:
+                return Declared(frozenset())
+            elements |= found
+            lengths.add(len(arguments) if origin is tuple and ... not in arguments else 0)
         elif origin is not Callable:  # a function stands in no config
-            return frozenset(), frozenset()
-    return frozenset(plain), frozenset(elements)
+            return Declared(frozenset())
+    return Declared(frozenset(plain), frozenset(elements), length=lengths.pop() if len(lengths) == 1 else 0)
 
 
-def _length(hint: Any) -> int:
-    """How many elements the tuples of a hint have; 0 where that is open."""
-    parts = typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)
-    counts = {len(typing.get_args(part)) for part in parts if typing.get_origin(part) is tuple}
-    is_open = any(typing.get_origin(part) in (list, Sequence) or ... in typing.get_args(part) for part in parts)
-    return counts.pop() if len(counts) == 1 and not is_open else 0
+def _parts(hint: Any) -> tuple[Any, ...]:
+    """The alternatives of a union; of any other hint itself."""
+    return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)

@@ -14,11 +14,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.data.base import Frame
+from emgs_jax.features.base import FeatureModel
 from emgs_jax.features.checkpoint import BACKBONE, DinoFiles, digest, load_part, require
 from emgs_jax.features.dinotxt import text_tower, vision_head
 from emgs_jax.features.images import ImageConfig, grid_size, network_input
-from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, load_text
+from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates
 from emgs_jax.features.tokens import Tokenizer
 from emgs_jax.io.packages import best_device, companion_problem, first_line
 
@@ -26,8 +27,8 @@ if TYPE_CHECKING:
     from torch import Tensor
 
 
-class DinoText:
-    """Text-aligned patch features of dino.txt (implements `FeatureModel`).
+class DinoText(FeatureModel):
+    """Text-aligned patch features of dino.txt.
 
     Args:
         name: of the model, for provenance: embeddings of another name are refused.
@@ -63,35 +64,29 @@ class DinoText:
         self._device = device or best_device(importlib.import_module("torch"), f"features={name}", "features.device")
         self._classes, self._templates, self._file = tuple(classes), tuple(templates), text
 
+    def _paths(self, *names: str) -> list[Path]:
+        return require(self._folder, names, self._files.source)
+
     @cached_property
     def identity(self) -> dict:
-        (head,) = require(self._folder, [self._files.vision_head], self._files.source)
-        return {"name": self._name, "version": 1, "vision_head": digest(head)}
+        return {"name": self._name, "version": 1, "vision_head": digest(*self._paths(self._files.vision_head))}
 
     @cached_property
     def settings(self) -> dict:
         needed = [*BACKBONE, self._files.vision_head]
         if self._classes and self._file is None:
             needed += self._files.text_encoder, self._files.vocabulary
-        weights = require(self._folder, needed, self._files.source)[1]
-        image = asdict(self._image)
-        return {"backbone": digest(weights), "image": {key: _plain(value) for key, value in image.items()}}
-
-    @cached_property
-    def text(self) -> TextEmbeddings:
-        if self._file is not None:
-            return load_text(self._file, self.identity, self._classes)
-        if not self._classes:
-            vectors = np.zeros((0, self._vision[0].config.hidden_size), np.float32)
-            return TextEmbeddings((), vectors, self._templates, self.identity)
-        return self.embed(self._classes)
+        image = {key: _plain(value) for key, value in asdict(self._image).items()}
+        return {"backbone": digest(self._paths(*needed)[1]), "image": image}
 
     def embed(self, names: tuple[str, ...]) -> TextEmbeddings:
         """Encode the prompts of each name and average the half that is aligned with patches."""
         import torch
 
-        needed = [self._files.text_encoder, self._files.vocabulary, self._files.vision_head]
-        encoder, vocabulary, _ = require(self._folder, needed, self._files.source)
+        if not names:
+            vectors = np.zeros((0, self._vision[0].config.hidden_size), np.float32)
+            return TextEmbeddings((), vectors, self._templates, self.identity)
+        encoder, vocabulary, _ = self._paths(self._files.text_encoder, self._files.vocabulary, self._files.vision_head)
         weights = load_part(encoder, "text_model.", "backbone.token_embedding.weight")
         sizes = len(weights["backbone.token_embedding.weight"]), len(weights["backbone.positional_embedding"])
         tokenizer = Tokenizer(vocabulary, *sizes)
@@ -103,12 +98,8 @@ class DinoText:
                 vectors = text_tower(tokens, weights, self._num_text_heads)
             return vectors[:, vectors.shape[1] // 2 :].cpu().numpy()
 
-        return TextEmbeddings(
-            tuple(names), average_over_templates(names, self._templates, encode), self._templates, self.identity
-        )
-
-    def check(self, dataset: Dataset) -> None:
-        """Any data set will do: all that is needed are its images."""
+        vectors = average_over_templates(names, self._templates, encode)
+        return TextEmbeddings(tuple(names), vectors, self._templates, self.identity)
 
     def extract(self, frame: Frame) -> np.ndarray:
         """Return the unit tokens of the vision head, float16 (rows, columns, f): one cell per patch."""
@@ -133,22 +124,19 @@ class DinoText:
     @cached_property
     def _vision(self) -> tuple[Any, dict[str, "Tensor"]]:
         """The backbone, and the weights of the head."""
-        require(self._folder, BACKBONE, self._files.source)
-        (path,) = require(self._folder, [self._files.vision_head], self._files.source)
+        *_, path = self._paths(*BACKBONE, self._files.vision_head)
         head = load_part(path, "visual_model.head.", "ln_final.weight")
-        folder = path.parent
-        backbone = read_backbone(folder, self._files.source)
-        found = getattr(backbone.config, "num_register_tokens", 0)
-        if found != self._num_registers:
-            raise ValueError(
-                f"{path} is for a backbone with {self._num_registers} registers, the one in {folder} has {found}: "
-                f"take the backbone that {self._files.source} names"
-            )
-        if head["ln_final.weight"].shape != (backbone.config.hidden_size,):
-            raise ValueError(
-                f"{path} is for a backbone of width {len(head['ln_final.weight'])}, the one in {folder} has "
-                f"{backbone.config.hidden_size}: take the backbone that {self._files.source} names"
-            )
+        backbone = read_backbone(path.parent, self._files.source)
+        registers = getattr(backbone.config, "num_register_tokens", 0)
+        for what, wanted, found in (
+            ("registers", self._num_registers, registers),
+            ("channels", len(head["ln_final.weight"]), backbone.config.hidden_size),
+        ):
+            if found != wanted:
+                raise ValueError(
+                    f"{path} is for a backbone with {wanted} {what}, the one in {path.parent} has {found}: "
+                    f"take the backbone that {self._files.source} names"
+                )
         return backbone.eval().float().to(self._device), {name: value.to(self._device) for name, value in head.items()}
 
 

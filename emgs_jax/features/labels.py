@@ -11,14 +11,15 @@ import numpy as np
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.labels import LabelFolder, as_unknown
+from emgs_jax.features.base import FeatureModel
 from emgs_jax.features.text import TextEmbeddings, read_text
 
 MAX_CHANNELS = 128  # CV_CN_MAX of OpenCV 5; 4 has 512
 MAX_ENLARGED = 32  # times; a network gives a class for each of its patches at least
 
 
-class LabelFeatures:
-    """Reads what a segmenter said of each image (implements `FeatureModel`).
+class LabelFeatures(FeatureModel):
+    """Reads what a segmenter said of each image.
 
     A pixel's feature is the vector of its class, or where there are scores the mean of all classes' vectors under them,
     unit length again. Without a file of embeddings each class has an axis of its own: all are equally far apart, and

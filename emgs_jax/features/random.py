@@ -1,17 +1,17 @@
 """Features without weights, for tests: a fixed random projection of local colours, and random text embeddings."""
 
 from collections.abc import Sequence
-from functools import cached_property
 
 import cv2
 import numpy as np
 
-from emgs_jax.data.base import Dataset, Frame
-from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, load_text, random_embeddings
+from emgs_jax.data.base import Frame
+from emgs_jax.features.base import FeatureModel
+from emgs_jax.features.text import TextEmbeddings, average_over_templates, check_templates, random_embeddings
 
 
-class RandomFeatures:
-    """Project the mean colour of each cell (implements `FeatureModel`). The text embeddings say nothing of colours.
+class RandomFeatures(FeatureModel):
+    """Project the mean colour of each cell. The text embeddings say nothing of colours.
 
     Args:
         cell: pixels a side.
@@ -30,23 +30,13 @@ class RandomFeatures:
         self.identity = {"name": "random", "version": 1, "width": width, "seed": seed}
         self.settings = {"cell": cell}
 
-    @cached_property
-    def text(self) -> TextEmbeddings:
-        if self._file is not None:
-            return load_text(self._file, self.identity, self._classes)
-        return self.embed(self._classes)
-
     def embed(self, names: tuple[str, ...]) -> TextEmbeddings:
         """Return pseudo-random vectors that depend on the prompts only."""
         vectors = np.zeros((0, self._width), np.float32)
         if names:
-            vectors = average_over_templates(
-                names, self._templates, lambda prompts: random_embeddings(prompts, self._width)
-            )
+            encode = lambda prompts: random_embeddings(prompts, self._width)  # noqa: E731
+            vectors = average_over_templates(names, self._templates, encode)
         return TextEmbeddings(tuple(names), vectors, self._templates, self.identity)
-
-    def check(self, dataset: Dataset) -> None:
-        """Any data set will do: all that is needed are its images."""
 
     def extract(self, frame: Frame) -> np.ndarray:
         """Return the unit projection of (r, g, b, 1) of each cell's mean colour in [0, 1], float16 (y, x, f)."""

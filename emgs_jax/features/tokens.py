@@ -9,13 +9,16 @@ import html
 import re
 import unicodedata
 import zlib
-from itertools import groupby
+from functools import cache
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-# Letters and all numbers but digits, a digit, or neither; Python has no class for letters alone.
-WORDS = re.compile(r"'s|'t|'re|'ve|'m|'ll|'d|[^\W\d_]+|\d|(?:[^\s\w]|_)+", re.IGNORECASE)
+if TYPE_CHECKING:
+    from tokenizers.pre_tokenizers import PreTokenizer
+
+WORDS = r"(?i)'s|'t|'re|'ve|'m|'ll|'d|\p{L}+|\p{N}|[^\s\p{L}\p{N}]+"  # letters, one number, or neither
 NARROWED = re.compile("[\u0132\u0133\u0149\u01c4-\u01cc\u01f1-\u01f3\u3000\ufb00-\ufb06\uff01-\uffef]")
 QUOTES = str.maketrans(dict.fromkeys("‘’‚‛ʼ", "'") | dict.fromkeys("“”„‟", '"'))
 END_OF_WORD = "</w>"
@@ -30,47 +33,40 @@ class Tokenizer:
     """
 
     def __init__(self, path: Path, num_tokens: int, length: int) -> None:
+        from tokenizers import models
+
         symbols = list(byte_symbols().values())
-        num_merges = num_tokens - 2 * len(symbols) - 2
-        merges = _read_merges(path, num_merges)
+        merges = _read_merges(path, num_tokens - 2 * len(symbols) - 2)
         names = [*symbols, *(symbol + END_OF_WORD for symbol in symbols), *(left + right for left, right in merges)]
-        self._number = {name: number for number, name in enumerate(names)}
-        self._rank = {pair: rank for rank, pair in enumerate(merges)}
+        numbers = {name: number for number, name in enumerate(names)}
+        self._pairs = models.BPE(vocab=numbers, merges=merges, end_of_word_suffix=END_OF_WORD)
         self._start, self._end, self._length = num_tokens - 2, num_tokens - 1, length
 
     def __call__(self, texts: list[str]) -> np.ndarray:
         """Return int64 (texts, length): start, text, end, zeros; a text that is too long is cut before the end."""
-        rows = np.zeros((len(texts), self._length), np.int64)
+        from tokenizers.pre_tokenizers import ByteLevel
+
+        rows, as_bytes = np.zeros((len(texts), self._length), np.int64), ByteLevel(False, use_regex=False)
         for row, text in zip(rows, texts, strict=True):
-            numbers = [self._number[part] for word in words_of(text) for part in self._parts(word)]
+            words = (as_bytes.pre_tokenize_str(word)[0][0] for word in words_of(text))
+            numbers = [token.id for word in words for token in self._pairs.tokenize(word)]
             numbers = [self._start, *numbers[: self._length - 2], self._end]
             row[: len(numbers)] = numbers
         return rows
-
-    def _parts(self, word: str) -> list[str]:
-        """Merge the symbols of a word, always the pair that comes first in the vocabulary."""
-        symbols = byte_symbols()
-        parts = [symbols[byte] for byte in word.encode()]
-        parts[-1] += END_OF_WORD
-        while len(parts) > 1:
-            pair = min(zip(parts, parts[1:], strict=False), key=lambda pair: self._rank.get(pair, len(self._rank)))
-            if pair not in self._rank:
-                break
-            merged: list[str] = []
-            for part in parts:
-                # A part that was just merged is longer than either of the pair, so it is not merged twice.
-                if merged and (merged[-1], part) == pair:
-                    merged[-1] += part
-                else:
-                    merged.append(part)
-            parts = merged
-        return parts
 
 
 def words_of(text: str) -> list[str]:
     """Return the parts of a text that are merged each by itself: words, single numbers, runs of signs."""
     cleaned = " ".join(clean(text).lower().split())
-    return [part for word in WORDS.findall(cleaned) for part in _without_numbers(word)]
+    return [word for word, _ in _splitter().pre_tokenize_str(cleaned)]
+
+
+@cache
+def _splitter() -> "PreTokenizer":
+    from tokenizers import Regex
+    from tokenizers.pre_tokenizers import Split
+
+    return Split(Regex(WORDS), "removed", invert=True)
 
 
 def clean(text: str) -> str:
@@ -82,17 +78,6 @@ def clean(text: str) -> str:
 def _narrow(sign: str) -> str:
     """Return a ligature of Latin letters or a full- or half-width character as the usual ones."""
     return unicodedata.normalize("NFKC", sign) if NARROWED.match(sign) else sign
-
-
-def _without_numbers(word: str) -> list[str]:
-    """Cut a word at its numbers, each of which stands alone: ² in m² is one, and a letter to Python's expressions."""
-    if not any(unicodedata.category(sign) in ("No", "Nl") for sign in word):
-        return [word]
-    parts: list[str] = []
-    for is_number, signs in groupby(word, lambda sign: unicodedata.category(sign).startswith("N")):
-        run = "".join(signs)
-        parts += [*run] if is_number else [run]
-    return parts
 
 
 def byte_symbols() -> dict[int, str]:

@@ -3,9 +3,10 @@
 import os
 import subprocess
 import sys
+from unittest import mock
 
 import pytest
-from tiny_run import CONF, compose
+from tiny_run import CONF
 
 from emgs_jax.config import configure
 from emgs_jax.device.settings import check_platforms, leave_memory_to_torch
@@ -20,30 +21,23 @@ def unset(monkeypatch):
 
 
 @pytest.mark.parametrize(
-    ("overrides", "is_shared"),
+    ("overrides", "value"),
     [
-        ((), False),
-        (("prior=multiview_stereo", "features=random"), False),
-        (("prior=recorded", "prior.folder=predictions"), False),
-        (("prior=mapanything",), True),
-        (("prior=recorded", "prior.folder=predictions", "features=dinov2_text", "features.checkpoint=weights"), True),
+        ((), None),
+        (("prior=multiview_stereo", "features=random"), None),
+        (("prior=recorded", "prior.folder=predictions"), None),
+        (("prior=mapanything",), "false"),
+        (("prior=recorded", "prior.folder=a", "features=dinov2_text", "features.checkpoint=weights"), "false"),
+        (("suite=smoke", "overrides=['prior=mapanything']"), "false"),
     ],
 )
-def test_memory_is_left_where_a_network_runs_in_torch(overrides, is_shared):
-    """JAX's backend was up, with 75 % of the memory, before torch loaded."""
-    leave_memory_to_torch(compose(*overrides))
-    assert os.environ.get(KEY) == ("false" if is_shared else None)
-
-
-def test_jobs_of_an_evaluation_say_it_in_words():
-    config = configure.compose("suite=smoke", "overrides=['prior=mapanything']", name="evaluate")
+def test_memory_is_left_where_a_network_runs_in_torch(monkeypatch, overrides, value):
+    """JAX's backend was up, with 75 % of the memory, before torch loaded. Jobs of an evaluation say it in words."""
+    config = configure.compose(*overrides, name="evaluate" if "suite=smoke" in overrides else "config")
     leave_memory_to_torch(config)
-    assert os.environ[KEY] == "false"
-
-
-def test_what_a_user_has_set_stays(monkeypatch):
-    monkeypatch.setenv(KEY, "true")
-    leave_memory_to_torch(compose("prior=mapanything"))
+    assert os.environ.get(KEY) == value
+    monkeypatch.setenv(KEY, "true")  # by the user
+    leave_memory_to_torch(config)
     assert os.environ[KEY] == "true"
 
 
@@ -60,27 +54,18 @@ def test_a_command_says_it_before_its_task(tmp_path):
     assert "set false" in ran.stdout
 
 
-def test_a_device_that_jax_does_not_find_is_named():
+@pytest.mark.parametrize("platforms", ["cpu", "nonsense"])
+def test_a_device_that_jax_does_not_find_is_named(platforms):
     """JAX_PLATFORMS=cuda without jax[cuda13] ended in "error: AssertionError"."""
-    code = "from emgs_jax.device.settings import check_platforms; check_platforms()"
-    for platforms, words in (
-        ("cpu", ""),
-        ("nonsense", "ValueError: JAX_PLATFORMS=nonsense, and JAX finds no such dev"),
-    ):
-        environment = os.environ | {"JAX_PLATFORMS": platforms}
-        done = subprocess.run(
-            [sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=False
-        )
-        assert words in done.stderr and bool(words) == bool(done.returncode)
+    command = [sys.executable, "-c", "from emgs_jax.device.settings import check_platforms; check_platforms()"]
+    environment = os.environ | {"JAX_PLATFORMS": platforms}
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
+    is_refused = "ValueError: JAX_PLATFORMS=nonsense, and JAX finds no such device" in done.stderr
+    assert is_refused == bool(done.returncode) == (platforms != "cpu")
 
 
 def test_a_backend_that_fails_without_a_word_is_named_too(monkeypatch):
-    import jax
-
-    def without_a_word():
-        raise AssertionError
-
     monkeypatch.setenv("JAX_PLATFORMS", "cuda")
-    monkeypatch.setattr(jax, "devices", without_a_word)
+    monkeypatch.setattr("jax.devices", mock.Mock(side_effect=AssertionError))
     with pytest.raises(ValueError, match="JAX_PLATFORMS=cuda, and JAX finds no such device: install"):
         check_platforms()

@@ -187,7 +187,7 @@ def test_damaged_and_foreign_weights_are_refused(checkpoint):
     weights.write_bytes(weights.read_bytes()[:2000])
     refused("holds no backbone that can be read .*: fetch config.json .*, from the tests")
     dinov2(dim=8).save_pretrained(folder, safe_serialization=True)
-    refused("is for a backbone of width 16, the one in .* has 8")
+    refused("is for a backbone with 16 channels, the one in .* has 8")
     config = transformers.Dinov2Config(
         hidden_size=DIM, num_hidden_layers=2, num_attention_heads=NUM_HEADS, mlp_ratio=2, patch_size=14, image_size=56
     )

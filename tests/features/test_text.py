@@ -41,8 +41,11 @@ def test_what_does_not_fit_and_a_newer_or_foreign_file_are_refused_with_the_reme
         load_text(path, MODEL, ["wall", "lamp"])
     with pytest.raises(ValueError, match="text.npz was embedded by .*'width': 3.*features are of .*'width': 4"):
         load_text(path, MODEL | {"width": 4})
-    with pytest.raises(ValueError, match="nowhere.npz is no file.*experiments.embed"):
-        load_text(path.parent / "nowhere.npz", MODEL)
+    foreign = path.parent / "foreign.npz"
+    for message in ("foreign.npz is no file: .*experiments.embed", "no file of text embeddings"):
+        with pytest.raises(ValueError, match=message):
+            load_text(foreign, MODEL)
+        foreign.write_bytes(b"\x93NUMPY\x01\x00")
     with np.load(path) as arrays:
         header, vectors = json.loads(str(arrays["header"])), arrays["embeddings"]
     for change, message in (
@@ -57,24 +60,3 @@ def test_what_does_not_fit_and_a_newer_or_foreign_file_are_refused_with_the_reme
         np.savez(path, header=np.array(json.dumps(header)), embeddings=wrong)
         with pytest.raises(ValueError, match="its embeddings are not those of its header"):
             load_text(path, MODEL)
-
-
-def test_a_damaged_file_is_refused_or_says_the_same(path):
-    """A flipped bit in the time stamps of the archive may leave the same content; anything else must be noticed."""
-    whole, rng, noticed = path.read_bytes(), np.random.default_rng(0), 0
-    for _ in range(60):
-        at = int(rng.integers(len(whole)))
-        for version in (whole[:at], whole[:at] + bytes([whole[at] ^ 1 << int(rng.integers(8))]) + whole[at + 1 :]):
-            path.write_bytes(version)
-            try:
-                text = load_text(path, MODEL)
-            except ValueError as error:
-                assert str(path) in str(error)
-                noticed += 1
-            else:
-                assert text.names == ("wall", "chair")
-                np.testing.assert_array_equal(text.vectors, [[0, 0, 1], [1, 0, 0]])
-    assert noticed >= 90
-    path.write_bytes(b"\x93NUMPY\x01\x00")
-    with pytest.raises(ValueError, match="no file of text embeddings"):
-        load_text(path, MODEL)

@@ -9,9 +9,8 @@ import pytest
 from tiny_run import compose
 
 import experiments.benchmark
-from experiments.benchmarks.data import load
-from experiments.benchmarks.registration import time_icp
-from experiments.benchmarks.timing import Candidate, compare, interleaved, spread
+from experiments.benchmark_icp import time_icp
+from experiments.timing import Candidate, compare, interleaved, load, spread
 
 
 def benchmark_config(*overrides: str):
@@ -20,21 +19,12 @@ def benchmark_config(*overrides: str):
 
 def test_candidates_take_turns_and_a_ratio_compares_the_same_turn(monkeypatch):
     order, clock = [], iter(np.cumsum([0, 5, 0, 1, 0, 20, 0, 5, 0, 40, 0, 5, 0, 80, 0, 5]) / 1e3)
-    monkeypatch.setattr("experiments.benchmarks.timing.time", SimpleNamespace(perf_counter=lambda: next(clock)))
+    monkeypatch.setattr("experiments.timing.time", SimpleNamespace(perf_counter=lambda: next(clock)))
     timings = compare(interleaved("part", {name: Candidate(partial(order.append, name)) for name in "ab"}, 3), "a")
     assert order == ["a", "b"] * 4  # the first turn does not count
     np.testing.assert_allclose(timings[0].seconds, [0.02, 0.04, 0.08])
     np.testing.assert_allclose(timings[1].facts["times_faster_than"]["a"], (8, 4, 16))
     assert spread([3.0, 1.0, 2.0]) == (2.0, 1.0, 3.0)
-
-
-def written(folder, timings) -> str:
-    """benchmark.md, after a look whether both files have every timing."""
-    about, text = json.loads((folder / "benchmark.json").read_text()), (folder / "benchmark.md").read_text()
-    assert [row["name"] for row in about["timings"]] == [timing.name for timing in timings]
-    assert all(f"| {timing.name} |" in text for timing in timings) and about["provenance"]["device"]["kind"] in text
-    assert all(len(timing.seconds) == 2 and min(timing.seconds) > 0 for timing in timings)
-    return text
 
 
 def test_what_cannot_be_timed_is_refused(tmp_path):
@@ -58,6 +48,9 @@ def test_both_registrations_find_the_pose_of_exact_views():
 def test_the_tables_hold_every_part(tmp_path):
     config = benchmark_config("benchmark.num_settings=[2]", "parts=[stages,sweep]")
     timings = experiments.benchmark.benchmark(config, tmp_path)
-    written(tmp_path, timings)
-    names = {timing.name for timing in timings}
-    assert {"E-step", "whole step", "2 settings, vmap"} <= names
+    about, text = json.loads((tmp_path / "benchmark.json").read_text()), (tmp_path / "benchmark.md").read_text()
+    names = [timing.name for timing in timings]
+    assert {"localize fine", "fuse", "whole step", "2 settings, vmap"} <= {*names}
+    assert [row["name"] for row in about["timings"]] == names and all(f"| {name} |" in text for name in names)
+    assert about["provenance"]["device"]["kind"] in text
+    assert all(len(timing.seconds) == 2 and min(timing.seconds) > 0 for timing in timings)

@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -26,12 +27,18 @@ from emgs_jax.config.configure import compose, groups
 from emgs_jax.config.overrides import parsed, readable
 from emgs_jax.io.files import owned
 from experiments.cli import COMMANDS, main
-from experiments.command import check_arguments, check_missing, check_out, kept_words, leave_float32, nothing_left
+from experiments.command import (
+    check_arguments,
+    check_missing,
+    check_out,
+    first_words,
+    kept_words,
+    leave_float32,
+    nothing_left,
+)
 from experiments.console import speak_on
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
-from experiments.merge import positionals
-from experiments.report import positional
 
 
 @pytest.mark.parametrize(
@@ -71,12 +78,38 @@ def test_a_word_in_the_place_of_a_group_is_an_error_for_every_group():
             compose("prior=multiview_stereo", f"{group.replace('/', '.')}={groups()[group][0]}")
 
 
-def test_the_arguments_of_a_multirun_are_checked_and_those_of_hydra_are_left_to_it():
-    words = ["-m", "slam.em.noise=0,1", "prior=simulated,multiview_stereo", "hydra.run.dir=x"]
-    assert check_arguments("config", words) is None
-    for option in (["-m"], ["--cfg", "job"]):
-        with pytest.raises(ValueError, match=r"slam\.em\.nose is no key"):
-            check_arguments("config", [*option, "slam.em.nose=0,1"])
+FOLDER = r"hydra\.run\.dir=.*: .*file is no folder that can be written to"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ("-m slam.em.nose=0,1", r"slam\.em\.nose is no key"),
+        ("--cfg job slam.em.nose=0,1", r"slam\.em\.nose is no key"),
+        ("dataset.root=my folder", "is no KEY=VALUE: put a value with spaces into quotes.*emgs run --help"),
+        ("dataset=images stop -m", "is no KEY=VALUE"),
+        ("hydra.run.dir=file", FOLDER),
+        ("hydra.run.dir=file/run", FOLDER),
+        ("--config-dir nowhere", "--config-dir nowhere is no folder"),
+        ("--config-dir own dataset=mine dataset.nothing=other", "is no key of the config"),
+        ("-m slam.em.noise=0,1 prior=simulated,multiview_stereo hydra.run.dir=x", None),
+        ("--cfg job --package slam ~hydra.run -m", None),
+        ("hydra.run.dir=new/run hydra.job.name=${out}", None),
+        ("--config-dir own dataset=mine dataset.root=other", None),
+        ("--config-dir=own dataset=mine", None),
+        ("-cd own dataset=mine", None),
+    ],
+)
+def test_words_are_checked_before_anything_begins_and_what_is_hydras_is_left_to_it(
+    words, message, tmp_path, monkeypatch
+):
+    """Of a folder that cannot be made Hydra tells by a traceback."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").write_text("")
+    (tmp_path / "own" / "dataset").mkdir(parents=True)
+    (tmp_path / "own" / "dataset" / "mine.yaml").write_text("_target_: emgs_jax.data.images.Images\nroot: walk\n")
+    with pytest.raises(ValueError, match=message) if message else contextlib.nullcontext():
+        check_arguments("config", words.split())
 
 
 def said_by(monkeypatch, capsys, *words: str) -> str:
@@ -116,7 +149,8 @@ def test_the_help_of_a_command_names_its_keys_and_its_examples_are_ones(name, mo
     assert not any(str(path) in said for path in (CONF.parent, Path.home(), Path(sys.prefix)))
     examples = [shlex.split(line) for line in said.splitlines() if line.startswith(f"  emgs {name} ")]
     assert len(examples) >= 2
-    rewritten = {"evaluate": delegated, "merge": positionals}.get(name, positional)
+    merged = first_words("folders", is_list=True)
+    rewritten = {"evaluate": delegated, "merge": merged}.get(name, first_words("folder"))
     for _, _, *words in examples:
         check_arguments(name, rewritten(words))
 
@@ -182,44 +216,22 @@ def test_no_help_imports_what_computes():
     assert len(lines) == 2 + len(COMMANDS) and [line for line in lines if not line.endswith(" []")] == []
 
 
-def test_the_wrong_word_ends_a_command_with_one_line():
-    done = run("experiments.run", "slam.em=paper")
-    assert done.returncode == 1 and done.stderr.startswith("error: slam.em=paper would put a word")
-    assert "Traceback" not in done.stderr
-
-
-def test_a_word_that_is_no_override_says_how_to_write_it():
-    for words in (["dataset.root=my", "folder"], ["dataset=images", "stop", "-m"]):
-        with pytest.raises(ValueError, match=r"is no KEY=VALUE: put a value with spaces into quotes.*emgs run --help"):
-            check_arguments("config", words)
-    check_arguments("config", ["--cfg", "job", "--package", "slam", "~hydra.run", "-m"])
-
-
-def test_what_has_to_be_given_is_named_with_the_command():
-    for name, key in (("view", "folder"), ("report", "folder"), ("export", "folder"), ("effects", "folder")):
-        with pytest.raises(ValueError, match=f"^{key} is not given .*: emgs {name} {key}=…$"):
+def test_what_has_to_be_given_is_named_with_the_command_or_its_options():
+    for name in ("view", "report", "export", "effects"):
+        with pytest.raises(ValueError, match=f"^folder is not given .*: emgs {name} folder=…$"):
             check_missing(name, compose(name=name))
     check_missing("view", compose("folder=x", name="view"))
-
-
-def test_a_choice_that_has_to_be_made_is_named_with_its_options():
     with pytest.raises(ValueError, match="^features is not given: choose features= one of dinov2_text, dinov3_text"):
         compose(name="embed")
 
 
 def test_a_folder_with_any_signs_is_the_first_word():
     for name in ("/runs/Küche (1), [a=b]", "it's", "outputs/a b"):
-        (word, *rest) = readable(positional(readable([name, "port=1"])))
+        (word, *rest) = readable(first_words("folder")(readable([name, "port=1"])))
         assert parsed(word).key_or_group == "folder" and parsed(word).value() == name and rest == ["port=1"]
-    assert positional(["folder=x"]) == ["folder=x"] and positional(["-m"]) == ["-m"]
-
-
-def test_a_folder_that_cannot_be_made_is_named_without_hydras_traceback(tmp_path):
-    (tmp_path / "file").write_text("")
-    for folder in (tmp_path / "file", tmp_path / "file" / "run"):
-        with pytest.raises(ValueError, match=r"hydra\.run\.dir=.*: .*file is no folder that can be written to"):
-            check_arguments("config", [f"hydra.run.dir={folder}"])
-    check_arguments("config", [f"hydra.run.dir={tmp_path / 'new' / 'run'}", "hydra.run.dir=${out}"])
+    for words in (["folder=x"], ["-m"], []):
+        assert first_words("folder")(words) == words == first_words("folders", is_list=True)(words)
+    assert first_words("folders", is_list=True)(["a", "b", "x=1"]) == ["folders=['a','b']", "x=1"]
 
 
 def test_an_output_that_cannot_be_written_is_named_before_the_work(tmp_path):
@@ -231,18 +243,6 @@ def test_an_output_that_cannot_be_written_is_named_before_the_work(tmp_path):
     for out in (None, "???", str(tmp_path / "new" / "folder"), str(tmp_path / "text.npz"), "relative"):
         check_out(OmegaConf.create({"out": out}))
     assert [path.name for path in tmp_path.iterdir()] == ["file"]
-
-
-def test_options_of_a_folder_of_ones_own_are_options(tmp_path):
-    """`--config-dir` is in Hydra's help, and what stood in that folder was refused."""
-    (tmp_path / "dataset").mkdir()
-    (tmp_path / "dataset" / "mine.yaml").write_text("_target_: emgs_jax.data.images.Images\nroot: walk\n")
-    for option in (["--config-dir", str(tmp_path)], [f"--config-dir={tmp_path}"], ["-cd", str(tmp_path)]):
-        check_arguments("config", [*option, "dataset=mine", "dataset.root=other"])
-        with pytest.raises(ValueError, match="is no key of the config"):
-            check_arguments("config", [*option, "dataset=mine", "dataset.nothing=other"])
-    with pytest.raises(ValueError, match="--config-dir nowhere is no folder"):
-        check_arguments("config", ["--config-dir", "nowhere"])
 
 
 def test_a_command_that_comes_to_nothing_leaves_nothing(tmp_path, monkeypatch):
@@ -276,30 +276,24 @@ def test_numbers_of_64_bits_are_turned_off_and_that_is_said(monkeypatch, capsys)
     assert not capsys.readouterr().out
 
 
-def test_a_command_that_is_refused_leaves_the_folder_of_the_one_that_is_in_it(tmp_path, monkeypatch):
-    """Two runs of the same second: the second was refused, and removed the folder of the first, which then failed."""
-    monkeypatch.setattr("experiments.command.HydraConfig", SimpleNamespace(get=lambda: hydra_of(tmp_path)))
-    (tmp_path / ".hydra").mkdir()
-    (tmp_path / "run.log").touch()
-    with owned(tmp_path), pytest.raises(ValueError, match="another program"), nothing_left(), owned(tmp_path):
-        pass
-    assert {path.name for path in tmp_path.iterdir()} == {".hydra", "run.log"}
-
-
-@pytest.mark.parametrize("own", ["notes.log", "session.log/frames.csv", "run.log", None])
+@pytest.mark.parametrize("own", ["notes.log", "session.log/frames.csv", "run.log", "held", None])
 @pytest.mark.parametrize("has_log", [True, False])
 def test_a_command_that_comes_to_nothing_removes_nothing_that_was_there(own, has_log, tmp_path, monkeypatch):
-    """`emgs report typo` in a folder of logs removed it with all of them, and an empty one where the user stood."""
+    """`emgs report typo` in a folder of logs removed it with all of them, an empty one where the user stood, and a run
+    of the same second the folder of the one before, which held it."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("experiments.command.HydraConfig", SimpleNamespace(get=lambda: hydra_of(tmp_path, has_log)))
     if has_log:
         (tmp_path / "run.log").touch()
-    if own is not None:
+    if own not in ("held", None):
         (tmp_path / own).parent.mkdir(exist_ok=True)
         (tmp_path / own).write_text("mine")
-    with pytest.raises(ValueError, match="wrong"), nothing_left():
+    before = {path: path.is_file() and path.read_text() for path in tmp_path.rglob("*")}
+    holder, message = (owned(tmp_path), "another program") if own == "held" else (contextlib.nullcontext(), "wrong")
+    with holder, pytest.raises(ValueError, match=message), nothing_left(), owned(tmp_path):
         raise ValueError("wrong")
-    assert tmp_path.is_dir() and (own is None or (tmp_path / own).read_text() == "mine")
+    assert tmp_path.is_dir()
+    assert own is None or before == {path: path.is_file() and path.read_text() for path in tmp_path.rglob("*")}
 
 
 def hydra_of(folder: Path, has_log: bool = True) -> SimpleNamespace:
@@ -313,30 +307,17 @@ def test_a_name_with_any_signs_is_read_and_a_run_of_nothing_leaves_nothing(tmp_p
     folder = tmp_path / "my runs" / "first"
     done = run("experiments.run", "dataset=images", "dataset.root=Küche (1)", f"hydra.run.dir={folder}")
     assert done.returncode == 1 and done.stderr.startswith("error: dataset.root=Küche (1) does not exist")
-    assert not folder.exists()
-
-
-@pytest.mark.parametrize("word", ["terminated", "interrupted"])
-def test_an_interrupt_is_one_word_and_no_traceback(word, monkeypatch, capfd):
-    """In the imports of a command, as `emgs` hears them."""
-    number = {"terminated": signal.SIGTERM, "interrupted": signal.SIGINT}[word]
-    monkeypatch.setattr(os, "_exit", raises)
-    monkeypatch.setattr(sys, "argv", ["emgs", "run", "dataset=nowhere"])
-    monkeypatch.setattr("experiments.cli.import_module", lambda *_: os.kill(os.getpid(), number) or sum(range(10)))
-    with heard(), pytest.raises(SystemExit) as ended:
-        main()
-    assert (ended.value.code, capfd.readouterr().err) == (128 + number, f"{word}\n")
+    assert "Traceback" not in done.stderr and not folder.exists()
 
 
 class Going:
-    """An object that sends a signal while it goes."""
+    """An object that does something while it goes."""
 
-    def __init__(self, number: int) -> None:
-        self.number = number
+    def __init__(self, last: Callable[[], None]) -> None:
+        self.last = last
 
     def __del__(self) -> None:
-        os.kill(os.getpid(), self.number)
-        sum(range(10))  # the handler runs here
+        self.last()
 
 
 @contextlib.contextmanager
@@ -353,55 +334,81 @@ def raises(code: int) -> None:
     raise SystemExit(code)
 
 
-@pytest.mark.parametrize(("number", "code"), [(signal.SIGTERM, 143), (signal.SIGINT, 130)])
-@pytest.mark.parametrize("place", ["collector", "object", "program"])
-def test_a_signal_is_not_lost_wherever_the_program_is(number, code, place, monkeypatch):
-    """Python prints what is raised in a callback of the collector, as JAX has one, and the run went on to its end."""
+WORDS = {signal.SIGTERM: "terminated\n", signal.SIGINT: "interrupted\n"}
 
+
+@pytest.mark.parametrize("number", WORDS)
+@pytest.mark.parametrize("place", ["collector", "object", "program", "imports"])
+def test_a_signal_ends_a_command_with_one_word_wherever_the_program_is(number, place, monkeypatch, capfd):
+    """Python prints what is raised in a callback of the collector, as JAX has one, and the run went on to its end."""
     sent = []
 
-    def callback(phase, info):
-        if phase == "start" and not sent:
+    def send(*_):
+        if not sent:
             sent.append(number)
             os.kill(os.getpid(), number)
-            sum(range(10))
+            sum(range(10))  # the handler runs here
 
-    before = [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)]
+    before = [signal.getsignal(one) for one in WORDS]
     monkeypatch.setattr(os, "_exit", raises)
+    monkeypatch.setattr(sys, "argv", ["emgs", "run", "dataset=nowhere"])
+    monkeypatch.setattr("experiments.cli.import_module", send)
+    if place == "collector":
+        gc.callbacks.append(send)
     with heard(), pytest.raises(SystemExit) as ended, clear_interrupt():
         match place:
             case "collector":
-                gc.callbacks.append(callback)
                 while not sent:  # nothing happens while another thread collects
                     gc.collect()
             case "object":
-                Going(number)
+                Going(send)
             case "program":
-                os.kill(os.getpid(), number)
+                send()
+            case "imports":
+                main()
         threading.Event().wait(5)
-    gc.callbacks[:] = [one for one in gc.callbacks if one is not callback]
-    assert ended.value.code == code
-    assert [signal.getsignal(one) for one in (signal.SIGTERM, signal.SIGINT)] == before
+    gc.callbacks[:] = [one for one in gc.callbacks if one is not send]
+    assert (ended.value.code, capfd.readouterr().err) == (128 + number, WORDS[number])
+    assert [signal.getsignal(one) for one in WORDS] == before
 
 
-THREADS = {  # which Python does not wait for as it ends, or does
-    "of SciPy, which are daemons": "tree = cKDTree(np.random.default_rng(0).random((400000, 3)))\n"
-    " os.write(1, b'begun\\n')\n while True: tree.query(tree.data + .01, workers=2)",
-    "that are waited for": "os.write(1, b'begun\\n')\n"
-    " thread = threading.Thread(target=time.sleep, args=(90,)); thread.start()\n"
-    " while True: thread.join(.1)",  # a signal just before one long wait is heard when that is over
+KEPT = """import atexit, os, threading, time, numpy as np
+from scipy.spatial import cKDTree
+from experiments.interrupt import clear_interrupt
+atexit.register(os.write, 1, b'Python ends')
+with clear_interrupt():
+ print('kept', end='')
+"""
+PROGRAMS = {  # with threads that Python does not wait for as it ends, or does; and one that has done its work
+    "daemons of SciPy": f"""{KEPT} tree = cKDTree(np.random.default_rng(0).random((400000, 3)))
+ os.write(1, b'begun\\n')
+ while True: tree.query(tree.data + .01, workers=2)
+""",
+    "threads that are waited for": f"""{KEPT} os.write(1, b'begun\\n')
+ thread = threading.Thread(target=time.sleep, args=(90,))
+ thread.start()
+ while True: thread.join(.1)  # a signal just before one long wait is heard when that is over
+""",
+    "an end": """import atexit, time
+from experiments.interrupt import clear_interrupt, end_clearly
+end_clearly()
+with clear_interrupt(): print('kept', end='')
+def end():
+ print('begun', flush=True)
+ for _ in range(900): time.sleep(.1)
+atexit.register(end)
+""",
 }
 
 
-@pytest.mark.parametrize("kind", THREADS)
-def test_an_interrupt_ends_the_program_whatever_its_threads_compute(kind):
-    """The kills found SIGSEGV, one time in fifty: Python ends, and what a thread computes with is gone before it."""
-    words = "import atexit, os, threading, time, numpy as np\nfrom scipy.spatial import cKDTree\n"
-    words += "from experiments.interrupt import clear_interrupt\natexit.register(os.write, 1, b'Python ends')\n"
-    words += f"with clear_interrupt():\n print('kept', end='')\n {THREADS[kind]}"  # in a buffer
-    with begun(words) as (process, first):
-        process.send_signal(signal.SIGINT)
-        assert (process.wait(60), process.stderr.read()) == (130, b"interrupted\n")
+@pytest.mark.parametrize("kind", PROGRAMS)
+def test_a_signal_ends_the_program_whatever_it_does(kind):
+    """The kills found SIGSEGV, one time in fifty: Python ends, and what a thread computes with is gone before it; and a
+    traceback of JAX's clean up, in a callback that Python calls as it ends."""
+    number = signal.SIGTERM if kind == "an end" else signal.SIGINT
+    with begun(PROGRAMS[kind]) as (process, first):
+        process.send_signal(number)
+        assert (process.wait(60), process.stderr.read().decode()) == (128 + number, WORDS[number])
         assert first + process.stdout.read() in (b"keptbegun\n", b"begun\nkept")
 
 
@@ -415,16 +422,6 @@ def begun(program: str):
         first = process.stdout.readline()
         assert first.endswith(b"begun\n")
         yield process, first
-
-
-def test_a_signal_after_the_work_is_done_is_no_traceback():
-    """Found by the kills: SIGTERM while JAX cleaned up, in a callback that Python calls as it ends."""
-    words = "import atexit, time\nfrom experiments.interrupt import clear_interrupt, end_clearly\nend_clearly()\n"
-    words += "with clear_interrupt(): pass\ndef end():\n print('begun', flush=True)\n"
-    words += " for _ in range(900): time.sleep(.1)\n"  # one long sleep hears no signal that came just before it
-    with begun(words + "atexit.register(end)") as (process, _):
-        process.send_signal(signal.SIGTERM)
-        assert (process.wait(60), process.stderr.read()) == (143, b"terminated\n")
 
 
 def test_a_signal_while_a_command_imports_ends_it_with_a_word():
@@ -459,21 +456,3 @@ def test_the_folder_of_several_runs_is_known_before_the_first(name):
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF.resolve())):
         config = hydra.compose(name, return_hydra_config=True)
     assert re.fullmatch(rf"multirun/({name}/)?synthetic/[\d_-]+", config.hydra.sweep.dir)
-
-
-def test_executables_from_the_cache_are_loaded_without_a_word(tmp_path):
-    """Symptom: the second `emgs predict prior=multiview_stereo` printed 48 errors of three thousand characters."""
-    script = (
-        "import logging, emgs_jax; from experiments.command import TALKATIVE\n"
-        "for library in TALKATIVE: logging.getLogger(library).setLevel(logging.WARNING)\n"
-        "import jax, jax.numpy as jnp\n"
-        "jax.jit(lambda x: jnp.sum(x[jnp.argsort(x)]))(jnp.arange(100.0))\n"
-    )
-    kept = {"JAX_COMPILATION_CACHE_DIR": str(tmp_path), "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0"}
-    environment = {k: v for k, v in os.environ.items() if k != "TF_CPP_MIN_LOG_LEVEL"} | kept
-    for _ in range(2):
-        done = subprocess.run(
-            [sys.executable, "-c", script], env=environment, cwd=CONF.parent, capture_output=True, text=True, check=True
-        )
-        assert "cpu_aot_loader" not in done.stderr
-    assert any(tmp_path.iterdir())

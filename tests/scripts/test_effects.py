@@ -72,8 +72,6 @@ def test_the_se3_table_shows_the_metrics_of_that_alignment(tmp_path):
     effect.metrics.update({"trajectory/ate_se3_m": [0.30], "reconstruction_se3/f1_5cm_percent": [40.0]})
     assert table([effect]).splitlines()[2].split(" | ")[3:] == ["10.00", "–", "–", "–", "50.0", "– |"]
     assert table([effect], "se3").splitlines()[2].split(" | ")[3:] == ["30.00", "–", "–", "–", "40.0", "– |"]
-    with pytest.raises(ValueError, match="align must be protocol or se3, got 'none'"):
-        table([effect], "none")
 
 
 @pytest.mark.parametrize(

@@ -26,20 +26,12 @@ def test_a_run_with_the_file_has_the_embeddings_of_a_run_with_the_classes(tmp_pa
     np.testing.assert_array_equal(chosen.text_features, live.text_features[2:])
 
 
-def test_a_file_of_another_width_is_refused(tmp_path):
-    path = write(tmp_path / "text.npz", "classes=[wall]", "features.width=8")
-    with pytest.raises(Exception, match="text.npz was embedded by .*'width': 8.*features are of .*'width': 16"):
-        build_prior(compose("features=random", f"features.text={path}"), dataset())
-
-
 def test_what_cannot_be_embedded_is_refused(tmp_path):
     with pytest.raises(ValueError, match="features=none has no text encoder"):
         write(tmp_path / "text.npz", "classes=[wall]", features="none")
     for classes in ("[]", "[wall,wall]"):
         with pytest.raises(ValueError, match="classes must name at least one class, each once"):
             write(tmp_path / "text.npz", f"classes={classes}")
-    with pytest.raises(ValueError, match="features"):
-        configure.compose("classes=[wall]", f"out={tmp_path / 'text.npz'}", name="embed")
 
 
 def test_dinov2s_images_have_mapanythings_patches():

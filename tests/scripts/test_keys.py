@@ -16,6 +16,8 @@ NEEDED = {
     "effects": ["folder=a"],
     "predict": ["out=a"],
     "segment": ["map=a", "truth=frames"],
+    "score": ["trajectory=a", "method=b"],
+    "view": ["folder=a"],
 }
 
 
@@ -39,6 +41,13 @@ def composed(name: str):
         ("evaluate", "overrides", "abc", "overrides must be a list of KEY=VALUE, got 'abc'"),
         ("evaluate", "overrides", ["abc"], "overrides must be a list of KEY=VALUE"),
         ("export", "formats", 3, "formats must be a list of names, got 3"),
+        ("effects", "align", "none", "align must be one of protocol, se3, got 'none'"),
+        ("score", "max_time_difference", math.nan, "max_time_difference must be a number from 0 to 1000000, got nan"),
+        ("score", "normal_neighbours", 2.5, "normal_neighbours must be a whole number from 3 to 1000, got 2.5"),
+        ("score", "min_matched_percent", "many", "min_matched_percent must be a number from 0 to 100, got 'many'"),
+        ("segment", "with_scale", 1, "with_scale must be one of True, False, got 1"),
+        ("view", "port", True, "port must be a whole number from 1 to 65535, got True"),
+        ("tune", "trials", 0, "trials must be a whole number from 1 on, got 0"),
         ("effects", "folder", 3, "folder must be text, got 3"),
         ("segment", "map", ["a", 3], r"map must be a folder or a list of folders, got \['a', 3\]"),
         ("segment", "map", [], r"map must be a folder or a list of folders, got \[\]"),

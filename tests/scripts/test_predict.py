@@ -9,7 +9,6 @@ import pytest
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, compose, dataset
 
 import experiments.predict
-from emgs_jax.io.files import owned
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.simulated.prior import Simulated
 from experiments.predict import predict
@@ -47,22 +46,6 @@ def test_with_a_back_end_places_that_are_seen_twice_are_recorded_too(tmp_path, c
     assert not list(none.glob("visits_*")) and "visits" not in capsys.readouterr().out
 
 
-def test_recording_again_asks_only_for_what_is_missing(tmp_path):
-    folder = record(tmp_path / "out")
-    kept = (folder / "000000.npz").stat().st_mtime_ns
-    content = (folder / "000002.npz").read_bytes()
-    (folder / "000002.npz").unlink()
-    record(folder)
-    assert (folder / "000002.npz").read_bytes() == content
-    assert (folder / "000000.npz").stat().st_mtime_ns == kept
-
-
-def test_a_folder_that_another_program_writes_into_is_refused(tmp_path):
-    with owned(tmp_path / "out"), pytest.raises(ValueError, match="another program is writing into .*out"):
-        record(tmp_path / "out")
-    assert not list((tmp_path / "out").iterdir())
-
-
 def test_a_folder_that_holds_a_run_is_refused(tmp_path):
     """The recording lay among the files of a run, and its size was that of all of them."""
     (tmp_path / "metrics.json").write_text("{}")
@@ -91,9 +74,3 @@ def test_a_run_from_the_recording_writes_the_same_bytes_as_the_live_run(tmp_path
     same = [key for key in live if not key.startswith(("time/", "memory/", "provenance"))]
     assert {key: live[key] for key in same} == {key: replay[key] for key in same}
     assert replay["provenance"]["prior"] == live["provenance"]["prior"] and replay["provenance"]["simulated"] is True
-
-
-def test_a_recording_of_another_sequence_is_refused(tmp_path):
-    folder = record(tmp_path / "out")
-    with pytest.raises(ValueError, match="was recorded with"):
-        run(compose("prior=recorded", f"prior.folder={folder}", "dataset.seed=1"), tmp_path)

@@ -63,19 +63,6 @@ def test_segment_says_of_labelled_frames_what_the_run_itself_said(exact_run, tmp
         segment(config)
 
 
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["query", "text=chari"], "error: 'chari' is no word of"),
-        (["segment", "truth=nowhere", "protocol=omcl"], "error: protocol=omcl is no option of protocol: there are c"),
-    ],
-)
-def test_the_programs_end_with_one_line(words, message, exact_run, tmp_path):
-    done = own_process.run("experiments.cli", *words, f"map={exact_run[0]}", f"out={tmp_path}")
-    assert done.returncode == 1 and done.stderr.startswith(message), done.stderr
-    assert "Traceback" not in done.stderr
-
-
 def test_a_command_says_what_it_did_and_nothing_of_its_libraries(exact_run, tmp_path):
     shutil.copytree(exact_run[0], tmp_path / "run")
     done = own_process.run("experiments.cli", "report", str(tmp_path / "run"))

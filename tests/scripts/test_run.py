@@ -13,7 +13,6 @@ from omegaconf import OmegaConf
 from tiny_run import NUM_FRAMES, TINY, WINDOW_SIZE, EditedPrior, compose, dataset
 
 import experiments.run
-from emgs_jax.config.configure import compose as compose_as_typed
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.gaussian_map import confirmed
@@ -213,14 +212,6 @@ def test_one_single_frame_is_mapped_and_says_why_it_has_no_trajectory_error(tmp_
     assert metrics["trajectory/ate_sim3_m"] is None and "poses" in metrics["trajectory/reason"]
     assert metrics["map/num_gaussians"] > 100 and metrics["reconstruction/accuracy_m"] < 0.05
     assert metrics["time/seconds_per_frame"] > 0 and {path.name for path in tmp_path.iterdir()} >= FILES
-
-
-def test_the_paper_experiment_takes_the_printed_readings():
-    config = compose_as_typed("experiment=paper", "slam.em.num_neighbours=7")
-    assert config.slam.initialization == "merged" and config.slam.em.determinant_weight == 1.0
-    assert config.slam.em.average.gain == "ema_printed" and config.slam.localization.coarse == "via_previous"
-    assert config.slam.fit.points_per_gaussian == 128 and config.slam.observation.thin == 1
-    assert config.slam.refinement.front_margin == 0.0 and config.slam.em.num_neighbours == 7
 
 
 def test_an_error_of_a_constructor_is_one_clear_line(monkeypatch):

@@ -122,17 +122,3 @@ def test_another_result_is_never_replaced_but_the_same_one_may_be_made_again(tmp
     with pytest.raises(ValueError, match="made with other settings .*method=NAME"):
         scored(*files, "evaluation.alignment=se3")
     assert path.read_bytes() == before
-
-
-@pytest.mark.parametrize(
-    ("override", "message"),
-    [
-        ("max_time_difference=nan", "^max_time_difference must be a number from 0 to 1000000, got nan"),
-        ("normal_neighbours=2.5", "^normal_neighbours must be a whole number from 3 to 1000, got 2.5"),
-        ("min_matched_percent=many", "^min_matched_percent must be a number from 0 to 100, got 'many'"),
-        ("evaluation.voxel_m=-1", "^evaluation.voxel_m must be a number"),
-    ],
-)
-def test_a_value_out_of_range_is_named_before_anything_is_read(override, message):
-    with pytest.raises(ValueError, match=message):
-        scored("trajectory=nowhere.txt", override)

@@ -80,7 +80,7 @@ def test_a_sweep_that_is_stopped_keeps_its_chunks_and_goes_on_with_those_of_the_
     """On an accelerator a chunk is stacked, and stacks of other sizes may round otherwise."""
     chunks = []
 
-    def stopped(work, chunk, bar):
+    def stopped(work, prior, chunk, bar):
         chunks.append([variant.setting for variant in chunk])
         if len(chunks) == 2:
             raise KeyboardInterrupt
@@ -113,9 +113,6 @@ def test_one_at_a_time_keeps_the_other_keys_as_the_config_has_them():
     config = compose(axes, "grid=one_at_a_time", name="sweep")
     settings = [tuple(v.setting.values()) for v in variants(config, read_axes(config))]
     assert settings == [(5.0, "count"), (0, "count"), (9, "count"), (5.0, "ema_printed")]
-    config.grid = "random"
-    with pytest.raises(ValueError, match="grid must be one of product, one_at_a_time, got 'random'"):
-        read_axes(config)
 
 
 @pytest.mark.parametrize("word", ["baseline=voxel", "graph=default"])
@@ -133,10 +130,6 @@ def test_an_infinite_value_is_text_in_the_results():
 @pytest.mark.parametrize(
     ("axes", "message"),
     [
-        (None, "no axis: choose one with sweep=gates"),
-        ({"slam.em.max_mahalanobis": [3]}, r"no key of a stage; near names: slam\.em\.max_mahalanobis_sq"),
-        ({"max_mahalanobis_sq": [3]}, r"near names: .*em\.max_mahalanobis_sq|near names: .*max_mahalanobis_sq"),
-        ({"slam.em.noise": 3}, r"must be a list of values, got 3: write slam\.em\.noise: \[3"),
         ({"slam.em.noise": []}, "must be a list of values"),
         ({"slam.em.noise": [[1, 2]]}, "numbers or names"),
         ({"prior.seed": [0, 1]}, r"experiments\.sweep -m prior\.seed"),

@@ -14,7 +14,7 @@ import experiments.together
 import experiments.tune
 from emgs_jax.config.configure import compose
 from experiments.command import check_arguments
-from experiments.search import allows, ask, front, open_study, read_objectives, read_space
+from experiments.search import ask, front, open_study, own_setting, read_objectives, read_space
 
 optuna = pytest.importorskip("optuna")
 GATE, GAP = "slam.em.max_mahalanobis_sq", "slam.em.max_log_gap"
@@ -40,7 +40,7 @@ def measured(monkeypatch):
 
     chunks = Chunks()
 
-    def measure(work, chunk, bar):
+    def measure(work, prior, chunk, bar):
         if chunks.stop_after is not None and len(chunks) == chunks.stop_after:
             raise KeyboardInterrupt
         seed = work.prior.provenance.settings["seed"]
@@ -154,8 +154,8 @@ def test_a_metric_that_is_none_is_named_and_a_trial_without_a_value_fails_and_th
         experiments.tune.tune([*WORDS, "objectives=[minimize trajectory/ate_sim_m]"], tmp_path / "other")
     measure = experiments.together.map_and_score
 
-    def lost(work, chunk, bar):
-        found = measure(work, chunk, bar)
+    def lost(work, prior, chunk, bar):
+        found = measure(work, prior, chunk, bar)
         return [m | {ATE: None} if v.setting[GAP] == 4.0 else m for m, v in zip(found, chunk, strict=True)]
 
     monkeypatch.setattr(experiments.together, "map_and_score", lost)
@@ -200,13 +200,9 @@ def test_whole_numbers_stay_whole(tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        ([], "nothing to search: choose a space with tune=gates, or 'space="),
-        (["space={slam.em.max_mahalanobis:{low:1,high:2}}"], rf"no key of a stage; near names: {GATE}"),
         ([f"space={{{GATE}:{{low:-1,high:2}}}}"], rf"{GATE} must be a number from 0 to inf, got -1"),
         ([f"space={{{GATE}:{{low:1,high:inf}}}}"], "cannot be drawn up to inf: give a finite end"),
-        ([f"space={{{GATE}:{{low:2,high:1}}}}"], "needs low < high"),
         ([f"space={{{GATE}:{{low:0,high:1,log:true}}}}"], "low above 0 with log: true"),
-        ([f"space={{{GATE}:3}}"], "must be a range .* or a list, got 3"),
         ([f"space={{{GATE}:[3,-4]}}"], rf"{GATE} must be a number from 0 to inf, got -4"),
         (["space={slam.em.support:{low:0,high:1}}"], r"write slam.em.support: \[printed, normalized\]"),
         ([SPACE], r"held_out names no sequence.*'held_out=\{fresh:\{prior\.seed:3\}\}'"),
@@ -214,9 +210,7 @@ def test_whole_numbers_stay_whole(tmp_path):
         ([SPACE, "held_out={../up:{prior.seed:3}}"], "plain names"),
         ([SPACE, f"held_out={{other:{{{GATE}:3}}}}"], "gives .* a value, but it is searched"),
         ([SPACE, "held_out={other:{prior.sed:3}}"], r"prior\.sed is no key of the config; near names: prior\.seed"),
-        ([SPACE, OTHER, "trials=0"], "trials must be a whole number from 1 on, got 0"),
         ([SPACE, OTHER, "graph=default"], "graph= is for run and evaluate: a search steps"),
-        ([SPACE, OTHER, f"objectives=[smaller {ATE}]"], "must be minimize METRIC or maximize METRIC"),
     ],
 )
 def test_what_cannot_be_searched_is_refused_with_the_remedy_and_nothing_is_written(measured, tmp_path, words, message):
@@ -232,9 +226,10 @@ def test_without_optuna_the_extra_is_named(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["gates", "weights"])
-def test_every_space_of_conf_holds_the_configs_own_values(name):
+def test_every_space_of_conf_holds_the_configs_own_values(name, tmp_path):
     config = compose(f"tune={name}", name="tune")
     space = read_space(config)
-    for key, allowed in space.items():
-        assert allows(allowed, OmegaConf.select(config, key)), key
+    study = open_study(tmp_path / "study.jsonl", {}, {F1: "maximize"})
+    (first,) = ask(study, space, own_setting(config, space), 1, 0, 9)
+    assert first.params == {key: OmegaConf.select(config, key) for key in space}
     assert list(read_objectives(config).values()) == ["minimize", "maximize"]

@@ -61,10 +61,9 @@ def calls(words: list[str]) -> list[tuple[Callable, tuple]]:
     from emgs_jax.config.configure import compose
     from emgs_jax.ops.executable import calling
     from emgs_jax.slam import step
-    from experiments.benchmarks.data import first_state, load
+    from experiments.timing import load
 
     data = load(compose(*words))
-    state, config = first_state(data)
     noted: list[tuple[Callable, tuple]] = []
 
     def note(executable: Callable, *arguments: Any) -> Any:
@@ -72,7 +71,7 @@ def calls(words: list[str]) -> list[tuple[Callable, tuple]]:
         return executable(*arguments)
 
     with calling(note):
-        step(state, data.prediction, data.camera, config)
+        step(data.state, data.prediction, data.camera, data.config)
     return noted
 
 
