@@ -17,7 +17,6 @@ M, N, F = 60, 40, 3
 POINTS, GAUSSIANS = sc.random_observation(M, num_features=F), sc.random_gaussians(N, num_features=F)
 QUIET = np.zeros((M, 3), np.float32)
 NOISE = (np.random.default_rng(5).normal(size=(M, 3)) * 0.1).astype(np.float32)
-ONES = np.ones(M, np.float32)
 estep, mstep, supported, updated_map = (sc.on_host(f) for f in (e_step, m_step, support, em_update))
 
 
