@@ -54,7 +54,7 @@ def _together(
     def offsets(own: Bool[Array, "n"], of_other: Bool[Array, "n"]) -> Float[Array, "n"]:
         layer, has_layer = nearest_layer(map, own, of_other, origins, depth_noise, known)
         apart = jnp.sum(gaussians.normals * (gaussians.means[layer] - gaussians.means), axis=-1)
-        rows, exists = knn(gaussians.means, gaussians.means, own, config.num_neighbours, own)
+        rows, exists = knn(gaussians.means, gaussians.means, own, min(config.num_neighbours, own.shape[0]), own)
         normals = jnp.einsum("ni,nki->nk", gaussians.normals, gaussians.normals[rows])
         is_alike = exists & (normals >= config.min_normal_cos)
         total = jnp.sum(jnp.where(is_alike, jnp.where(has_layer, apart, 0.0)[rows], 0.0), axis=-1)

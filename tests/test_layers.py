@@ -88,3 +88,11 @@ def test_what_is_no_second_layer_stays(config, parts, change, words):
     )
     np.testing.assert_array_equal(one.gaussians.means, map.gaussians.means)
     assert np.asarray(one.gaussians.valid).all()
+
+
+@pytest.mark.parametrize("count", [1, 2])
+def test_maps_of_fewer_gaussians_than_a_mean_is_over_become_one_too(config, count):
+    map, is_other = walls(FIRST[:count], FIRST[:count] + [0, 0, GAP])
+    one = after(config, map, is_other)
+    np.testing.assert_array_equal(one.gaussians.valid, ~is_other)
+    np.testing.assert_allclose(np.asarray(one.gaussians.means)[:count, 2], 3.0 + GAP / 2, atol=1e-6)

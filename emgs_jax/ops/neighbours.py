@@ -120,7 +120,7 @@ def nearby(
     size: int,
     order: Int[Array, "m"] | None = None,
 ) -> Nearby:
-    """The `count` points nearest to any query of each block, of those in the groups whose boxes are nearest to it.
+    """The `count` points nearest to any query of each block, of those in the groups whose boxes are nearest to one.
 
     Args:
         asked: those that count; one that is not within reach never does.
@@ -144,9 +144,7 @@ def _nearest_to_any(
     blocks: Float[Array, "b q d"], counts: Bool[Array, "b q"], groups: Groups, count: int
 ) -> tuple[Int[Array, "b c"], Bool[Array, "b c"], Float[Array, "b"]]:
     """`nearby` for blocks as they are; a query that does not count is at -FAR."""
-    low = jnp.min(jnp.where(counts[..., None], blocks, FAR), axis=1)
-    high = jnp.max(blocks, axis=1)
-    gap_sq = _distance_to_boxes_sq(low, high, groups)
+    gap_sq = _distance_to_boxes_sq(blocks, groups)
     num_groups = min(max(NUM_GROUPS, -(-count // GROUP)), groups.rows.shape[0])
     negative, near = jax.lax.top_k(-gap_sq, num_groups)
     # The least of what `top_k` gives, not its last column: XLA makes a whole sort of one that is sliced.
@@ -166,14 +164,18 @@ def _nearest_to_any(
     return rows, negative > -FAR_SQ, beyond_sq
 
 
-def _distance_to_boxes_sq(low: Float[Array, "b d"], high: Float[Array, "b d"], groups: Groups) -> Float[Array, "b g"]:
-    """Squared distance of each block's box to those of the groups."""
-    corners = (jnp.unstack(x, axis=-1) for x in (low, high, groups.low, groups.high))
-    gaps = tuple(
-        jnp.maximum(jnp.maximum(group_low - b[:, None], a[:, None] - group_high), 0.0)
-        for a, b, group_low, group_high in zip(*corners, strict=True)
-    )
-    return dot(gaps, gaps)
+def _distance_to_boxes_sq(blocks: Float[Array, "b q d"], groups: Groups) -> Float[Array, "b g"]:
+    """Squared distance of the boxes of the groups to the nearest query of each block.
+
+    Not to the box round the block: queries that are far apart would have much of all between them, and none near.
+    """
+    corners = tuple(zip(jnp.unstack(groups.low, axis=-1), jnp.unstack(groups.high, axis=-1), strict=True))
+    nearest_sq = jnp.full((blocks.shape[0], groups.rows.shape[0]), jnp.inf)
+    for query in jnp.unstack(blocks, axis=1):
+        entries = zip(jnp.unstack(query[:, None], axis=-1), corners, strict=True)
+        gaps = tuple(jnp.maximum(jnp.maximum(low - x, x - high), 0.0) for x, (low, high) in entries)
+        nearest_sq = jnp.minimum(nearest_sq, dot(gaps, gaps))
+    return nearest_sq
 
 
 def of_queries(near: Nearby, values: Shaped[Array, "b q *v"], num_queries: int) -> Shaped[Array, "m *v"]:

@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from emgs_jax.ops.neighbours import compact_rows, curve_order, group_points, knn, nearest
 
 search, compacted, along_curve = on_host(knn), on_host(compact_rows), on_host(curve_order)
+roughly = on_host(lambda queries, points, valid, asked: nearest(queries, asked, points, group_points(points, valid), 3))
 # Sizes of most tests, so that they share programs: a few blocks of queries among few and among many groups of points.
 NUM_QUERIES, NUM_POINTS, MANY_QUERIES, MANY_POINTS = 300, 1000, 1300, 2400
 
@@ -59,6 +60,18 @@ def test_near_queries_and_scattered_ones_among_many_points_equal_brute_force(k):
     queries = np.concatenate([plane[::2], uniform(7, 100, 3, low=-5, high=5)])
     valid = np.random.default_rng(6).uniform(size=MANY_POINTS) < 0.9
     check(np.random.default_rng(8).permutation(queries), plane, valid, k, EVERY)
+
+
+@pytest.mark.parametrize("count", [8, 100, NUM_QUERIES])
+def test_few_queries_that_are_far_from_each_other_find_what_is_nearest_to_each(count):
+    """As the candidates of a frame that the map explains but for some corners: a box round a block holds all."""
+    floor = uniform(16, MANY_POINTS, 3) * np.float32([30, 30, 0.01])
+    queries = filled(uniform(17, count, 3) * np.float32([30, 30, 0.0]), NUM_QUERIES)
+    rows, found = roughly(queries, floor, np.ones(MANY_POINTS, bool), np.arange(NUM_QUERIES) < count)
+    expected, _ = cKDTree(floor.astype(float)).query(queries[:count].astype(float))
+    distances = np.linalg.norm(floor[rows[:count, 0]].astype(float) - queries[:count], axis=-1)
+    assert found[:count].all()
+    np.testing.assert_allclose(distances, expected, rtol=1e-3)  # ranks take what differs by less as equal
 
 
 @pytest.mark.parametrize("spread", [0.02, 50.0])
