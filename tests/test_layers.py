@@ -54,6 +54,22 @@ def test_what_only_one_of_both_shows_stays_and_no_step_is_between(config):
     assert (steps >= 0).all() and (steps < GAP / 2).any() and (steps > GAP / 4).any()
 
 
+def test_the_walls_of_a_corner_do_not_move_each_other(config):
+    """Both maps show the side wall at one place, and the wall beside it 4 cm apart."""
+    x = np.minimum(FIRST[:, 0], 0.55)
+    corner = np.stack([x, FIRST[:, 1], 3.0 - (FIRST[:, 0] - x)], axis=1)
+    is_side = corner[:, 0] == 0.55
+    parts = [
+        flat_gaussians(points, 0.05, normal, 0.003, features=(1.0, 0.0))
+        for gap in (0.0, GAP)
+        for points, normal in ((corner[~is_side] + [0, 0, gap], NORMAL), (corner[is_side], (-1.0, 0.0, 0.0)))
+    ]
+    one = after(config, fresh_map(join(*parts), 2.0, 0.5), np.repeat([False, True], len(FIRST)))
+    expected = np.concatenate([corner[~is_side] + [0, 0, GAP / 2], corner[is_side]])
+    np.testing.assert_array_equal(one.gaussians.valid, np.repeat([True, False], len(FIRST)))
+    np.testing.assert_allclose(np.asarray(one.gaussians.means)[: len(FIRST)], expected, atol=1e-5)
+
+
 @pytest.mark.parametrize(
     ("parts", "change", "words"),
     [

@@ -7,25 +7,38 @@ import numpy as np
 
 
 class Spool:
-    """A sequence of arrays that grows at its end, for any thread; the file has no name and goes with the object."""
+    """A sequence of arrays that grows at its end, for any thread; the file has no name and goes with the object.
+
+    The file has bytes alone: of `numpy.save` it would have headers, and two threads that parse some at once are a
+    SystemError before Python 3.11.8.
+    """
 
     def __init__(self) -> None:
-        self._file, self._begins = tempfile.TemporaryFile(), []  # noqa: SIM115 (open as long as this object)
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 (open as long as this object)
+        self._places: list[tuple[int, tuple[int, ...], np.dtype]] = []  # of each array: begin, shape and type
         self._lock, self.num_bytes = threading.Lock(), 0
 
     def append(self, array: np.ndarray) -> int:
         """Add an array; returns its position."""
         with self._lock:
             begin = self._file.seek(0, 2)
-            np.save(self._file, array, allow_pickle=False)
+            self._file.write(_bytes(np.asarray(array, order="C")))
             self.num_bytes = self._file.tell()
-            self._begins.append(begin)
-            return len(self._begins) - 1
+            self._places.append((begin, array.shape, array.dtype))
+            return len(self._places) - 1
 
     def __len__(self) -> int:
-        return len(self._begins)
+        return len(self._places)
 
     def __getitem__(self, index: int) -> np.ndarray:
         with self._lock:
-            self._file.seek(self._begins[index])
-            return np.load(self._file, allow_pickle=False)
+            begin, shape, dtype = self._places[index]
+            array = np.empty(shape, dtype)
+            self._file.seek(begin)
+            self._file.readinto(_bytes(array))
+            return array
+
+
+def _bytes(array: np.ndarray) -> np.ndarray:
+    """The memory of a contiguous array."""
+    return array.reshape(-1).view(np.uint8)

@@ -38,6 +38,7 @@ from emgs_jax.pose_graph.chordal import chordal_initialization
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, optimize
 from emgs_jax.pose_graph.problem import problem_of
+from emgs_jax.pose_graph.sparse import damped_step, normal_equations
 
 ROOT = Path(__file__).resolve().parents[2]
 GRAPHS = ROOT.parent / "shared" / "data" / "graphs"
@@ -96,6 +97,44 @@ def test_where_the_solver_starts_exact_measurements_have_no_error_left():
     problem = problem_of(PoseGraph(given, edges), 0.0)
     nodes = rows_of(chordal_initialization(problem.graph, problem.free), np.arange(30))
     np.testing.assert_allclose(error(nodes, truth), 0.0, atol=1e-9)
+
+
+def test_where_the_solver_starts_measurements_count_by_the_mean_of_their_information():
+    """Of two steps that are measured differently: the mean position, and the angle of the mean rotation matrix."""
+    nodes = put(walk(2), T_world=poses_of(np.tile(np.eye(4), (2, 1, 1))))
+    steps, roots = np.array([[0.1, 0, 0, 0, 0, 0.2], [0.3, 0.2, 0, 0, 0, -0.1]]), np.random.default_rng(0)
+    roots = roots.uniform(1.0, 9.0, (2, 7, 7)) * np.array([[1, 1, 1, 5, 1, 1, 1], [1, 1, 1, 1, 1, 9, 1]])[:, None]
+    edges = put(measure(nodes, [(0, 1)] * 2), Z_a_b=poses_of(exp(steps)), sqrt_info=roots)
+    problem = problem_of(PoseGraph(nodes, edges), 0.0)
+    found = matrices_of(rows_of(chordal_initialization(problem.graph, problem.free).T_world, np.arange(2)))[1]
+    information = np.einsum("erk,erk->ek", roots, roots)
+    of_place, of_turn = (np.mean(information[:, part], axis=1) for part in (slice(3), slice(3, 6)))
+    turn = np.arctan2(of_turn @ np.sin(steps[:, 5]), of_turn @ np.cos(steps[:, 5]))
+    np.testing.assert_allclose(found[:3, 3], of_place @ exp(steps)[:, :3, 3] / of_place.sum(), atol=1e-9)
+    np.testing.assert_allclose(found[:3, :3], exp([[0, 0, 0, 0, 0, turn]])[0, :3, :3], atol=1e-9)
+
+
+def test_there_is_no_such_start_where_nodes_are_turned_by_each_other_alone():
+    nodes = put(walk(3), T_world=poses_of(np.tile(np.eye(4), (3, 1, 1))))
+    edges = measure(nodes, window_pairs(3, (1,)))
+    edges = put(edges, sqrt_info=lambda roots: roots * (np.arange(7) < [[[3]], [[7]]]))
+    problem = problem_of(PoseGraph(nodes, edges), 0.0)
+    assert chordal_initialization(problem.graph, problem.free) is None
+
+
+def test_a_damped_step_is_that_of_dense_matrices():
+    rng, ends = np.random.default_rng(0), np.array([[0, 1], [1, 2], [2, 0]])
+    residuals, jacobians, prior = (rng.uniform(-1, 1, shape) for shape in ((3, 4, 1), (3, 4, 4), (3, 2, 2)))
+    free, prior = np.array([[False, False], [True, True], [True, False]]), prior**2
+    J = np.zeros((3, 4, 3, 2))
+    for row, pair in enumerate(ends):
+        J[row][:, pair] = jacobians[row].reshape(4, 2, 2)
+    J, rows, (information, pull) = J.reshape(12, 6), free.ravel(), prior.reshape(6, 2).T
+    H, g = J.T @ J + np.diag(information), J.T @ residuals.reshape(12) + pull
+    H, expected = H[rows][:, rows], np.zeros(6)
+    expected[rows] = -np.linalg.solve(H + 0.5 * np.diag(np.diag(H)), g[rows])
+    found = damped_step(normal_equations(ends, residuals, jacobians, free, prior), 0.5)
+    np.testing.assert_allclose(found[:, 0], expected, atol=1e-12)
 
 
 def test_a_loop_of_scale_alone_spreads_linearly():

@@ -136,7 +136,9 @@ def test_a_point_beyond_the_gate_costs_what_it_would_at_the_gate_and_informs_nob
     settings = at(config("slam/localization=default").localization.icp, "residual", reading)
     matches, problem = random_problem(np.random.default_rng(0))
     given = NOWHERE, matches, problem, settings
-    outlier = np.asarray(problem.source.valid) & ~np.asarray(matches.is_inlier)
+    valid = np.asarray(problem.source.valid)
+    outlier = valid & ~np.asarray(matches.is_inlier)
+    assert not valid.all() and not rows_of(*given)[~valid].any(), "and one that is not valid costs nothing"
     rows = rows_of(*given)[outlier] ** 2 / float(problem.weight) / float(settings.max_mahalanobis_sq)
     np.testing.assert_allclose(rows[:, [0, 2, 3, 4]].sum(1), 1.0, rtol=1e-5)
     np.testing.assert_allclose(rows[:, 1], float(reading != DISTRIBUTION), rtol=1e-5)
