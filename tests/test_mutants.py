@@ -79,7 +79,7 @@ def test_a_sample_is_the_same_each_time_half_of_the_core_and_of_code_that_compil
 def test_each_mutant_that_was_made_by_hand_changes_the_code_and_has_tests():
     for one in by_hand():  # which refuses a text that does not occur exactly once
         assert compiles(one), one
-        assert nearest_tests(one.file, reach=1), one
+        assert nearest_tests(one.file, reach=2), one
 
 
 def test_a_file_meets_its_own_tests_first_and_then_those_that_import_it():

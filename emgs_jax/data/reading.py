@@ -12,7 +12,6 @@ import cv2
 import numpy as np
 from jaxtyping import Float, Float32, UInt8
 from PIL import ExifTags, Image
-from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import BadFrameError
 
@@ -363,6 +362,8 @@ def rigid(position: Sequence[float], quaternion: Sequence[float]) -> Float[np.nd
     """The motion to a position, turned by a quaternion x, y, z, w; ValueError where one is not finite or this not 1."""
     if not np.isfinite(position).all() or not abs(math.hypot(*quaternion) - 1) <= RIGID_TOLERANCE:
         raise ValueError("its quaternion has not length 1")
+    from scipy.spatial.transform import Rotation  # slow to import, and no command's help needs it
+
     pose = np.eye(4)
     pose[:3, :3], pose[:3, 3] = Rotation.from_quat(quaternion).as_matrix(), position
     return pose

@@ -132,7 +132,5 @@ def test_what_is_missing_or_does_not_fit_is_named(run, tmp_path):
             scored(run, truth, **values)
 
     refused("class file .*nowhere.yaml does not exist", classes="nowhere.yaml")
-    refused("alignment must be one of trajectory, points; got 'guess'", alignment="guess")
-    refused(r"map must be a folder or a list of folders, got \[\]", map=[])
     refused("truth=frames has the data set's names: leave it out", truth="frames")
     refused("frames.jsonl has no true pose to place the map by", blind)

@@ -10,11 +10,9 @@ from dataclasses import replace
 import matplotlib
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 from PIL import Image
 from written_run import CLASSES, two_walls, written_run
 
-from emgs_jax.config import configure
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report.finished_run import read_run
@@ -22,7 +20,6 @@ from emgs_jax.report.layers import closing_covariances, covariances, map_layers,
 from emgs_jax.report.viewer import HOST, Viewer
 from emgs_jax.report.viewer_answers import ask, find_words, highlighted, picked
 from emgs_jax.report.viewer_scene import field_of_view, shown
-from experiments.view import view
 
 NAMES = ("wall", "sofa", "sofa table", "Chair")
 
@@ -199,18 +196,10 @@ def test_a_map_without_features_says_what_a_text_needs(tmp_path):
         assert "class" not in viewer.layer.options
 
 
-def test_a_taken_port_and_a_missing_extra_are_clear(run, monkeypatch):
-    config = configure.compose(f"folder='{run.folder}'", name="view")
-
-    def with_values(**values):
-        return OmegaConf.merge(config, values)
-
-    with pytest.raises(ValueError, match="port must be a whole number from 1 to 65535"):
-        view(with_values(port=0))
-    with monkeypatch.context() as patch:
-        patch.setitem(sys.modules, "viser", None)
-        with pytest.raises(ValueError, match=r'pip install "emgs_jax\[viewer\]"'):
-            Viewer(shown(run), free_port())
+def test_a_missing_extra_is_clear(run, monkeypatch):
+    monkeypatch.setitem(sys.modules, "viser", None)
+    with pytest.raises(ValueError, match=r'pip install "emgs_jax\[viewer\]"'):
+        Viewer(shown(run), free_port())
 
 
 def wait(condition, what, timeout=120.0):
