@@ -70,7 +70,9 @@ def match_on_image(
     """The K_2D nearest visible map splats of every candidate, and the squared distance under Σ_map + Σ_candidate."""
     groups = group_points(map_splats.means, visible)
     asked = candidate_splats.means, candidate_splats.valid
-    rows, found = nearest(*asked, map_splats.means, groups, config.num_candidates)
+    # Candidates may be few and far from each other: few of them share a list, and that is long.
+    k = config.num_candidates
+    rows, found = nearest(*asked, map_splats.means, groups, k, size=4, count=16 * k)
     covs = map_splats.covs[rows] + candidate_splats.covs[:, None]
     offsets = map_splats.means[rows] - candidate_splats.means[:, None]
     return rows, mahalanobis_sq(offsets, inverse_2x2(covs)), found

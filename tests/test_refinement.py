@@ -4,14 +4,16 @@ import numpy as np
 import pytest
 import reference
 import scene as sc
+from scipy.spatial import cKDTree
 
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.refinement import refine
+from emgs_jax.refinement import match_on_image, refine
+from emgs_jax.render.project import Splats
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
-refined = sc.on_host(refine)
+refined, matched = map(sc.on_host, (refine, match_on_image))
 CAMERA_POSE = sc.pose()
 NUM_MAP, NUM_NEW = 104, 40  # rows of every map and of all candidates, most of which are free: one program for all
 
@@ -255,3 +257,24 @@ def test_invalid_candidates_and_map_rows_change_nothing(settings, camera, poison
     sc.assert_same(wild[2], clean[2])
     sc.assert_same(sc.rows_of(wild[0], known), sc.rows_of(clean[0], known))
     sc.assert_same(sc.rows_of(wild[1], clean[1].valid), sc.rows_of(clean[1], clean[1].valid))
+
+
+def splats(means, is_valid) -> Splats:
+    """Round ones of four pixels."""
+    n, eye = len(means), np.tile(np.eye(2), (len(means), 1, 1))
+    arrays = means, 16 * eye, eye / 16, np.ones(n), np.ones(n), np.ones(n), np.zeros((n, 2)), is_valid, np.ones(n)
+    return Splats(*map(sc.device, arrays))
+
+
+@pytest.mark.parametrize("count", [5, 20, 60, 600])
+def test_candidates_however_few_and_scattered_are_matched_with_the_splats_that_are_nearest_to_each(config, count):
+    """Late in a run a frame has few, all over the image, among thousands of splats."""
+    rng, room = np.random.default_rng(count), (320, 240)
+    on_image, means = rng.uniform(size=(3000, 2)) * room, np.zeros((600, 2))
+    means[:count] = rng.uniform(size=(count, 2)) * room
+    every, config = np.ones(3000, bool), config().refinement
+    rows, distance_sq, found = matched(splats(on_image, every), splats(means, np.arange(600) < count), every, config)
+    distances, expected = cKDTree(on_image).query(means[:count], config.num_candidates)
+    assert found[:count].all() and np.mean(rows[:count] == expected) > 0.99  # the farthest may be another
+    np.testing.assert_array_equal(rows[:count, 0], expected[:, 0])
+    np.testing.assert_allclose(distance_sq[:count, 0], distances[:, 0] ** 2 / 32, rtol=1e-3, atol=1e-4)  # in float32
