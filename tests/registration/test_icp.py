@@ -427,3 +427,12 @@ def test_a_common_error_of_scale_is_found_only_where_it_may_be(source, target, s
     _, found, _ = solve(small, target, start_at(TRUTH, settings), sc.at(settings, "scale_noise", 10.0))
     assert none == 1.0
     assert found == pytest.approx(1.03, abs=0.01)  # points are matched with the centres of sparse Gaussians
+
+
+@pytest.mark.parametrize(("max_field", "factor"), [(0.2, 1.05), (0.02, 1.0)])
+def test_the_field_is_what_depths_err_by_together_and_what_is_beyond_its_gate_says_nothing_of_it(
+    source, target, settings, max_field, factor
+):
+    held = sc.changed(settings, prior_information=1e9, max_field=max_field)
+    _, _, info = solve(sc.replace(source, points=np.asarray(source.points) * 1.05), target, start_at(TRUTH, held), held)
+    np.testing.assert_allclose(np.median(info.field.nodes), np.log(factor), atol=0.015)
