@@ -167,8 +167,7 @@ def merge_duplicates(
     share = other.weight / jnp.maximum(map.weight + other.weight, jnp.finfo(jnp.float32).tiny)
     mean = blend(old, other.gaussians, share, jnp.zeros(()))
     difference = other.gaussians.means - old.means
-    along = difference - _inner(difference, mean.normals)[:, None] * mean.normals
-    spread = (share * (1.0 - share))[:, None, None] * outer(along)
+    spread = (share * (1.0 - share))[:, None, None] * outer(along_surface(difference, mean.normals))
     features = old.features + config.feature * other.gaussians.features
     joined = GaussianMap(
         gaussians=eqx.tree_at(lambda g: (g.covs, g.features), mean, (mean.covs + spread, features)),
@@ -267,6 +266,11 @@ def nearest_layer(
     distance_sq = jax.lax.map(distance_to, (rows.T, found.T))
     partner = jnp.take_along_axis(rows, jnp.argmin(distance_sq, axis=0)[:, None], axis=1)[:, 0]
     return partner, jnp.min(distance_sq, axis=0) < jnp.inf
+
+
+def along_surface(offsets: Float[Array, "*b 3"], normals: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
+    """The part of each offset that is at right angles to its normal."""
+    return offsets - _inner(offsets, normals)[..., None] * normals
 
 
 def _inner(first: Float[Array, "*b d"], second: Float[Array, "*#b d"]) -> Float[Array, "*b"]:

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from emgs_jax.existence import ExistenceConfig, nearest_layer
+from emgs_jax.existence import ExistenceConfig, along_surface, nearest_layer
 from emgs_jax.gaussian_map import GaussianMap, without
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.linalg import outer, safe_normalize
@@ -91,8 +91,7 @@ def _fused(
         return total(weight * values) / jnp.maximum(total(weight), jnp.finfo(jnp.float32).tiny)
 
     means, normals = mean(old.means), safe_normalize(mean(old.normals))
-    offsets = old.means - means[to]
-    along = offsets - jnp.sum(offsets * normals[to], axis=-1, keepdims=True) * normals[to]
+    along = along_surface(old.means - means[to], normals[to])
     features = old.features + config.feature * (total(old.features) - old.features)
     fused = GaussianMap(
         gaussians=Gaussians(means, mean(old.covs + outer(along)), mean(old.colors), normals, features, old.valid),

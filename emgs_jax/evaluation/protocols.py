@@ -5,7 +5,6 @@ One scene gives a confusion matrix, int64 (c, c + 1) as in `segmentation`; scene
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -17,13 +16,9 @@ from emgs_jax.evaluation.segmentation import (
     segmentation_metrics,
     transfer_labels,
 )
-from emgs_jax.ops.ranges import number
+from emgs_jax.ops.ranges import number, one_of
 
 NAMES = ("miou", "fmiou", "acc")
-
-
-def _one_of(*names: str) -> Any:
-    return field(metadata={"choices": names})
 
 
 @dataclass(frozen=True)
@@ -49,18 +44,18 @@ class SegmentationProtocol:
     """
 
     name: str
-    compared_at: str = _one_of("truth", "map")
+    compared_at: str = one_of("truth", "map")
     num_neighbours: int = number(low=1, high=1000)
     none_votes: bool = field()
     voxel_m: float = number(low=0, high=1000)
-    offered: str = _one_of("all", "kept", "scene")
+    offered: str = one_of("all", "kept", "scene")
     ignored: list[str] = field()
     logit_scale: float = number(low=1e-6, high=1e6)
     min_probability: float = number(low=0, high=1)
     min_class_probability: float = number(low=0, high=1)
-    counted: str = _one_of("seen", "in_truth")
-    scenes: str = _one_of("sum", "mean")
-    accuracy: str = _one_of("mean_recall", "overall")
+    counted: str = one_of("seen", "in_truth")
+    scenes: str = one_of("sum", "mean")
+    accuracy: str = one_of("mean_recall", "overall")
 
 
 def ignored_positions(classes: Sequence[str], protocol: SegmentationProtocol) -> list[int]:

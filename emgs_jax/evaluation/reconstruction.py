@@ -3,7 +3,7 @@
 import itertools
 import math
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -24,7 +24,7 @@ from emgs_jax.evaluation.clouds import (
 )
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.geometry import Sim3
-from emgs_jax.ops.ranges import number
+from emgs_jax.ops.ranges import number, one_of
 
 Metrics = dict[str, float | int | str | None]
 _BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is computed in between stays in the cache
@@ -35,8 +35,8 @@ class EvaluationConfig:
     """The protocol of a comparison; it is written into every result. Values: conf/evaluation."""
 
     protocol: str
-    alignment: str = field(metadata={"choices": ("sim3", "se3")})  # se3: without the scale
-    statistic: str = field(metadata={"choices": ("mean", "rmse")})  # of the distances
+    alignment: str = one_of("sim3", "se3")  # se3: without the scale
+    statistic: str = one_of("mean", "rmse")  # of the distances
     max_distance_m: float = number(low=1e-6, high=math.inf)  # longer distances count as this long; F1 does not change
     max_depth_m: float = number(low=1e-6, high=math.inf)  # true depth farther away is left out
     icp_distance_m: float = number(low=0)  # ICP after the alignment takes pairs within this distance; 0 = no ICP

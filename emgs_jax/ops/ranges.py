@@ -25,3 +25,8 @@ def ranged(low: float | int | None, high: float | int | None) -> Mapping[str, An
 def number(low: float | int | None = None, high: float | int | None = None) -> Any:
     """A field of a plain dataclass that is one number, or several, from `low` to `high`."""
     return dataclasses.field(metadata=ranged(low, high))
+
+
+def one_of(*names: str, default: Any = dataclasses.MISSING) -> Any:
+    """A field of a plain dataclass that is one of `names`."""
+    return dataclasses.field(default=default, metadata={"choices": names})

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from emgs_jax.io.ply import with_colors, write_ply
 from emgs_jax.io.ply_reader import read_vertices, scale_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.mapping.records import UNPLACED
-from emgs_jax.ops.ranges import number
+from emgs_jax.ops.ranges import number, one_of
 from emgs_jax.report.colors import OURS, STATUS_COLORS, rgb, save_png
 from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.report.moving import moving_mask
@@ -38,9 +38,9 @@ class ExportConfig:
     scale: float | None = number(low=1e-6, high=1e6)  # factor on all lengths; None = 1
     length: Sequence[float] | None = number(low=0, high=2**31)  # instead of it, see `factor_of`
     # As in the run, or in the size on disk; either way without distortion.
-    images: str = field(default="used", metadata={"choices": ("used", "original")})
+    images: str = one_of("used", "original", default="used")
     # What moves stays in the images, or there is a mask beside each, black where something moves.
-    moving: str = field(default="kept", metadata={"choices": ("kept", "masked")})
+    moving: str = one_of("kept", "masked", default="kept")
 
 
 def export(run: FinishedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:

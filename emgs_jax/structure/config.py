@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from emgs_jax.data.masks import Masks
-from emgs_jax.ops.ranges import number
+from emgs_jax.ops.ranges import number, one_of
 
 PARTS = ("extraction", "matching", "verification", "incremental", "global")  # of the options
 
@@ -40,7 +40,7 @@ class StructureConfig:
     model: str | None
     features: str
     matcher: str | None
-    mapper: str = field(metadata={"choices": ("incremental", "global")})
+    mapper: str = one_of("incremental", "global")
     camera_model: str
     refine_distortion: bool
     masks: Masks

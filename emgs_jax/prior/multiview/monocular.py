@@ -1,13 +1,13 @@
 """Depth of a network that looks at one image, or at a video, on the poses of a structure and at its scale."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 from jaxtyping import Float
 from tqdm import tqdm
 
-from emgs_jax.ops.ranges import number
+from emgs_jax.ops.ranges import number, one_of
 from emgs_jax.prior.multiview.dense import DenseConfig, Depth, Depths, Scene, tried_depths
 from emgs_jax.prior.multiview.landmark_fit import KINDS, LandmarkFit, LandmarkFitConfig, fit_to_landmarks, to_depth
 from emgs_jax.prior.multiview.landmarks import landmarks_of, point_information
@@ -27,7 +27,7 @@ class MonocularConfig(DenseConfig):
     """
 
     fit: LandmarkFitConfig
-    kind: str = field(metadata={"choices": KINDS})
+    kind: str = one_of(*KINDS)
     cell: float = number(low=1e-3, high=1)
     pixel_std: float = number(low=1e-3, high=100)
 

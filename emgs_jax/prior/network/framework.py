@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol
@@ -10,7 +10,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from emgs_jax.features.checkpoint import BACKBONE
-from emgs_jax.ops.ranges import number
+from emgs_jax.ops.ranges import number, one_of
 from emgs_jax.prior.network.resize import Resize, Size, resize_intrinsics
 
 View = dict[str, Any]  # of the framework: `img`, `data_norm_type` and what else the network is told
@@ -112,7 +112,7 @@ class ComputeConfig:
     """
 
     device: str | None
-    amp: str = field(metadata={"choices": ("bf16", "fp16", "float32")})
+    amp: str = one_of("bf16", "fp16", "float32")
     memory_efficient: bool
     minibatch_size: int | None = number(low=1)
 
