@@ -10,7 +10,7 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import GaussianMap, without
-from emgs_jax.gaussians import blend, has_feature
+from emgs_jax.gaussians import Gaussians, blend, has_feature
 from emgs_jax.observation import Observation, depth_range
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.linalg import (
@@ -82,6 +82,24 @@ class Look(NamedTuple):
     depth_noise: Float[Array, ""]
 
 
+class Seen(NamedTuple):
+    """An earlier frame, in which later ones have found what moves.
+
+    Args:
+        depth: nearest and farthest z (m) round each pixel, 0 where it has none.
+        moves: pixels that were taken for static when it was mapped, and have moved.
+        T_world_camera: from where it was seen, as is known by now.
+        depth_noise: of its points, as a fraction of their depth.
+        time: of the frame; -1 where there is none.
+    """
+
+    depth: Float[Array, "2 p"]
+    moves: Bool[Array, "p"]
+    T_world_camera: jaxlie.SE3
+    depth_noise: Float[Array, ""]
+    time: Int[Array, ""]
+
+
 def fusion_evidence(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> Int[Array, "n"]:
     """Return a frame's evidence for every Gaussian: 1 with points fused into it, -1 without, 0 outside the submap.
 
@@ -121,17 +139,11 @@ def update_existence(
         The map, and which Gaussians were seen.
     """
     view, T_world_camera, camera, depth_noise = look
-    gaussians, rotation = map.gaussians, T_world_camera.rotation().as_matrix()
-    rays = gaussians.means - T_world_camera.translation()
-    pixels, depth = project(camera, rays @ rotation)
-    index, inside = nearest_pixel(pixels, (camera.height, camera.width))
-    nearest, farthest = depth_range(view, T_world_camera, camera)[:, index]
-    variance = quadratic(lower_entries(gaussians.covs), jnp.unstack(gaussians.normals, axis=-1))
-    reach = config.num_std * jnp.sqrt((depth_noise * depth) ** 2 + variance)
-    is_steep = jnp.abs(_inner(gaussians.normals, rays)) >= config.min_cos * jnp.linalg.norm(rays, axis=-1)
-    is_looked_at = gaussians.valid & inside & (depth > NEAREST_DEPTH) & is_steep
-    is_seen = is_looked_at & (jnp.minimum(jnp.abs(depth - nearest), jnp.abs(depth - farthest)) <= reach)
-    is_seen_through = is_looked_at & (depth < nearest - reach)
+    gaussians = map.gaussians
+    depths = depth_range(view, T_world_camera, camera)
+    _, is_seen, is_seen_through, depth, variance = _sight(
+        gaussians, depths, T_world_camera, camera, depth_noise, config
+    )
 
     spread = 0.5 * (jnp.trace(gaussians.covs, axis1=-2, axis2=-1) - variance)  # variance along the surface
     has_points = spread >= (depth / camera.focal[0]) ** 2
@@ -141,6 +153,50 @@ def update_existence(
     existence = jnp.where(change == 0, map.existence, existence)
     updated = eqx.tree_at(lambda m: m.existence, map, existence)
     return without(updated, existence < config.refuted), is_seen
+
+
+@full_precision
+def take_back(map: GaussianMap, seen: Seen, camera: Camera, config: ExistenceConfig) -> GaussianMap:
+    """Take back what an earlier frame has said for Gaussians that it saw where, as is known by now, something moved.
+
+    It counts as one that did not explain them: `hit` is taken back and `miss` taken away.
+
+    Args:
+        camera: of the frame's rows.
+    """
+    depths = jnp.where(seen.depth > 0, seen.depth, jnp.nan)
+    index, is_seen, *_ = _sight(map.gaussians, depths, seen.T_world_camera, camera, seen.depth_noise, config)
+    is_wrong = is_seen & seen.moves[index]
+    existence = jnp.where(is_wrong, map.existence - config.hit - config.miss, map.existence)
+    updated = eqx.tree_at(lambda m: m.existence, map, existence)
+    return without(updated, is_wrong & (existence < config.refuted))
+
+
+def _sight(
+    gaussians: Gaussians,
+    depths: Float[Array, "2 p"],
+    T_world_camera: jaxlie.SE3,
+    camera: Camera,
+    depth_noise: Float[Array, ""],
+    config: ExistenceConfig,
+) -> tuple[Int[Array, "n"], Bool[Array, "n"], Bool[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
+    """Of each Gaussian its pixel, whether it is seen there, and seen through; its depth, and variance along its normal.
+
+    Args:
+        depths: that a frame shows round each pixel, see `depth_range`.
+    """
+    rotation = T_world_camera.rotation().as_matrix()
+    rays = gaussians.means - T_world_camera.translation()
+    pixels, depth = project(camera, rays @ rotation)
+    index, inside = nearest_pixel(pixels, (camera.height, camera.width))
+    nearest, farthest = depths[:, index]
+    variance = quadratic(lower_entries(gaussians.covs), jnp.unstack(gaussians.normals, axis=-1))
+    reach = config.num_std * jnp.sqrt((depth_noise * depth) ** 2 + variance)
+    is_steep = jnp.abs(_inner(gaussians.normals, rays)) >= config.min_cos * jnp.linalg.norm(rays, axis=-1)
+    is_looked_at = gaussians.valid & inside & (depth > NEAREST_DEPTH) & is_steep
+    is_seen = is_looked_at & (jnp.minimum(jnp.abs(depth - nearest), jnp.abs(depth - farthest)) <= reach)
+    is_seen_through = is_looked_at & (depth < nearest - reach)
+    return index, is_seen, is_seen_through, depth, variance
 
 
 @full_precision

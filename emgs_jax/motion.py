@@ -1,13 +1,16 @@
-"""Moving things: points that stand where earlier frames looked through. Free space decides, not a class."""
+"""Moving things: points that stand where other frames look through. Free space decides, not a class."""
 
 import math
+from collections.abc import Callable
+from dataclasses import replace
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
+from emgs_jax.existence import Seen
 from emgs_jax.observation import Observation, depth_range
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.precision import full_precision
@@ -36,16 +39,28 @@ class MotionConfig(eqx.Module):
 
 
 class Looks(eqx.Module):
-    """Free space of the last tracked frames, newest first.
+    """The last tracked frames, newest first, and what later frames say of their points.
 
     Args:
-        depth: of each, nearest and farthest z (m) among a pixel and its eight neighbours; 0 where it has none.
-        moving: pixels that were taken for moving: they are no evidence that something stands there.
+        points: of each in its own camera frame (m), as it was aligned; 0 where it has none.
+        depth: nearest and farthest z (m) among a pixel and its eight neighbours; 0 where it has none.
+        said: pixels that were taken for moving when the frame was mapped.
+        moving: those, and what later frames show to have moved: they are no evidence that something stands there.
+        log_odds: of static to moving, of later frames: a sum of log-likelihood ratios.
+        free: most free space that a later frame has shown behind a point so far, in standard deviations.
+        step: the largest step of that from one frame to the next.
+        time: of each frame, as `SlamState.time`; -1 where there is none.
         T_previous_look: of each camera, in that of the last frame: however the map moves, they stay as they are.
     """
 
+    points: Float[Array, "k p 3"]
     depth: Float[Array, "k 2 p"]
+    said: Bool[Array, "k p"]
     moving: Bool[Array, "k p"]
+    log_odds: Float[Array, "k p"]
+    free: Float[Array, "k p"]
+    step: Float[Array, "k p"]
+    time: Int[Array, "k"]
     T_previous_look: jaxlie.SE3
 
 
@@ -58,8 +73,58 @@ def no_looks(view: Observation, config: MotionConfig) -> Looks | None:
     if config.num_looks == 0:
         return None
     size, poses = view.valid.shape[-1], jnp.tile(jaxlie.SE3.identity().wxyz_xyz, (config.num_looks, 1))
-    depth, moving = jnp.zeros((config.num_looks, 2, size)), jnp.zeros((config.num_looks, size), bool)
-    return Looks(depth, moving, jaxlie.SE3(poses))
+    zeros, nothing = jnp.zeros((config.num_looks, size)), jnp.zeros((config.num_looks, size), bool)
+    return Looks(
+        points=jnp.zeros((config.num_looks, size, 3)),
+        depth=jnp.zeros((config.num_looks, 2, size)),
+        said=nothing,
+        moving=nothing,
+        log_odds=zeros,
+        free=zeros,
+        step=zeros,
+        time=jnp.full(config.num_looks, -1, jnp.int32),
+        T_previous_look=jaxlie.SE3(poses),
+    )
+
+
+@full_precision
+def look_back(
+    looks: Looks,
+    view: Observation,
+    moving: Bool[Array, "p"],
+    T_world_camera: jaxlie.SE3,
+    T_world_previous: jaxlie.SE3,
+    estimate: PoseEstimate,
+    camera: Camera,
+    config: MotionConfig,
+) -> Looks:
+    """The looks with what one more frame says of them, see `_evidence` and `_moves`.
+
+    `find_movers` asks the looks before a frame, this the frames after a look. They are asked apart: what stands for a
+    while and then leaves has moved, however many looks before have seen it stand.
+
+    Args:
+        view: the frame as it was aligned, world frame.
+        moving: its rows that move.
+        estimate: of its pose, with the noise of its depths; where that is 0 it is not known, and nothing is said.
+    """
+    T_camera_previous = T_world_camera.inverse() @ T_world_previous
+    poses = jax.vmap(lambda look: (T_camera_previous @ jaxlie.SE3(look)).wxyz_xyz)(looks.T_previous_look.wxyz_xyz)
+    depth, evidence = jnp.nan_to_num(depth_range(view, T_world_camera, camera)), _evidence(estimate, camera, config)
+    ratios, free = jax.vmap(lambda points, T: evidence(jaxlie.SE3(T) @ points, depth, moving))(looks.points, poses)
+    is_told = (looks.depth[:, 0] > 0) & (estimate.depth_noise > 0)
+    log_odds = looks.log_odds + jnp.where(is_told, ratios, 0.0)
+    free = jnp.where(is_told, jnp.maximum(free, looks.free), looks.free)
+    step = jnp.maximum(looks.step, free - looks.free)
+    moves = jax.vmap(lambda *told: _moves(*told, camera, config))(looks.depth[:, 0] > 0, log_odds, step)
+    return replace(
+        looks,
+        moving=looks.said | moves,
+        log_odds=log_odds,
+        free=free,
+        step=step,
+        T_previous_look=jaxlie.SE3(poses),
+    )
 
 
 @full_precision
@@ -68,24 +133,36 @@ def look_again(
     view: Observation,
     moving: Bool[Array, "p"],
     T_world_camera: jaxlie.SE3,
-    T_world_previous: jaxlie.SE3,
+    time: Int[Array, ""],
     camera: Camera,
 ) -> Looks:
-    """The looks after one more frame, which is one of them if it has a valid point.
+    """The looks, relative to this camera, with a frame as the newest one if it has a valid point.
 
     Args:
         view: the frame as it was aligned, world frame.
         moving: its rows that move.
     """
-    T_camera_previous = T_world_camera.inverse() @ T_world_previous
-    old = jax.vmap(lambda look: (T_camera_previous @ jaxlie.SE3(look)).wxyz_xyz)(looks.T_previous_look.wxyz_xyz)
-    poses = jnp.concatenate([jaxlie.SE3.identity().wxyz_xyz[None], old[:-1]])
-    newest = jnp.nan_to_num(depth_range(view, T_world_camera, camera))
-    depth = jnp.concatenate([newest[None], looks.depth[:-1]])
-    marked = jnp.concatenate([moving[None], looks.moving[:-1]])
+    zeros = jnp.zeros(moving.shape)
+    newest = Looks(
+        points=jnp.where(view.valid[:, None], T_world_camera.inverse() @ view.points, 0.0),
+        depth=jnp.nan_to_num(depth_range(view, T_world_camera, camera)),
+        said=moving,
+        moving=moving,
+        log_odds=zeros,
+        free=zeros,
+        step=zeros,
+        time=time,
+        T_previous_look=jaxlie.SE3.identity(),
+    )
     is_look = jnp.any(view.valid)
-    depth, marked = jnp.where(is_look, depth, looks.depth), jnp.where(is_look, marked, looks.moving)
-    return Looks(depth, marked, jaxlie.SE3(jnp.where(is_look, poses, old)))
+    return jax.tree.map(lambda new, old: jnp.where(is_look, jnp.concatenate([new[None], old[:-1]]), old), newest, looks)
+
+
+def as_seen(looks: Looks, row: int, T_world_last: jaxlie.SE3, depth_noise: Float[Array, ""]) -> Seen:
+    """A look as what later frames have found that it saw; `depth_noise` is that of the last frame."""
+    look = jax.tree.map(lambda leaf: leaf[row], looks)
+    moves = look.moving & ~look.said
+    return Seen(look.depth, moves, T_world_last @ look.T_previous_look, depth_noise, look.time)
 
 
 @full_precision
@@ -97,48 +174,79 @@ def find_movers(
     camera: Camera,
     config: MotionConfig,
 ) -> Bool[Array, "p"]:
-    """Which valid points of a frame move.
+    """Which valid points of a frame move, by the looks before it, see `_evidence` and `_moves`.
 
-    A look at a point of depth z is compared with the depths d round its pixel there: with g the distance to them in
-    standard deviations, its log-likelihood ratio of static to moving is hit - g²/2. Before them, in free space, it is
-    -miss at the least, since either prediction may be wrong; behind them it is not seen, and 0 at the least. The
-    variance of z - d is that of both depths, 2 (ν z)², and what the pose of the frame may err at that distance. What no
-    look saw is static.
-
-    Depths of a network drift: what stands comes nearer by some percent a frame, until all older looks see through it.
-    What moves leaves free space from one look to the next. With j the largest step, in standard deviations, of the free
-    space behind a point from one look to the one before that, the log-odds of static are prior + hit - j²/2 at least.
+    What no look saw is static.
 
     Args:
         view: camera frame, in the map's unit.
         T_previous_camera: from this camera to that of the last frame.
         estimate: of this pose, with the noise ν of depths; where that is 0 it is not known, and nothing moves.
     """
+    evidence = _evidence(estimate, camera, config)
+
+    def ask(look: Looks) -> tuple[Float[Array, "p"], Float[Array, "p"]]:
+        return evidence((look.T_previous_look.inverse() @ T_previous_camera) @ view.points, look.depth, look.moving)
+
+    ratios, free = jax.vmap(ask)(looks)
+    step = jnp.max(jnp.diff(jax.lax.cummax(free), axis=0, prepend=0.0), axis=0)
+    is_told = view.valid & (estimate.depth_noise > 0)
+    return _moves(is_told, jnp.sum(ratios, axis=0), step, camera, config)
+
+
+def _evidence(estimate: PoseEstimate, camera: Camera, config: MotionConfig) -> Callable:
+    """What a look says of points in its camera frame: a log-likelihood ratio, static to moving, and free space.
+
+    A point of depth z is compared with the depths d round its pixel in the look: with g the distance to them in
+    standard deviations, the ratio is hit - g²/2. Before them, in free space, it is -miss at the least, since either
+    prediction may be wrong; behind them the point is not seen, and it is 0 at the least. The variance of z - d is that
+    of both depths, 2 (ν z)², and what the pose may err at that distance.
+
+    Args:
+        estimate: of the newer one of both poses.
+
+    Returns:
+        Of points (p, 3), the look's range of depths (2, p) and its pixels that move: the ratios, and the free space
+        behind each point in standard deviations; 0 where the look shows nothing.
+    """
     pose_variance = jnp.diagonal(estimate.covariance)
     shift, turn = jnp.mean(pose_variance[:3]), jnp.mean(pose_variance[3:6])
 
-    def compare(
-        look: tuple[Float[Array, "2 p"], Bool[Array, "p"], Float[Array, "7"]],
+    def evidence(
+        points: Float[Array, "p 3"], depth: Float[Array, "2 p"], moving: Bool[Array, "p"]
     ) -> tuple[Float[Array, "p"], Float[Array, "p"]]:
-        """Log-likelihood ratio of a look, and the free space that it shows behind each point; 0 where it shows none."""
-        (nearest, farthest), moving, T_previous_look = look[0], look[1], jaxlie.SE3(look[2])
-        pixels, z = project(camera, (T_previous_look.inverse() @ T_previous_camera) @ view.points)
+        pixels, z = project(camera, points)
         index, inside = nearest_pixel(pixels, (camera.height, camera.width))
+        nearest, farthest = depth[:, index]
         std = jnp.sqrt(2.0 * (estimate.depth_noise * z) ** 2 + shift + turn * z**2)
         std = jnp.maximum(std, NEAREST_DEPTH)
-        before, behind = (jnp.maximum(gap, 0.0) / std for gap in (nearest[index] - z, z - farthest[index]))
-        found = jnp.maximum(config.hit - 0.5 * (before + behind) ** 2, jnp.where(before > 0, -config.miss, 0.0))
-        found = jnp.where(moving[index], jnp.minimum(found, 0.0), found)
-        is_seen = inside & (z > NEAREST_DEPTH) & (nearest[index] > 0)
-        return jnp.where(is_seen, found, 0.0), jnp.where(is_seen, before, 0.0)
+        before, behind = (jnp.maximum(gap, 0.0) / std for gap in (nearest - z, z - farthest))
+        ratio = jnp.maximum(config.hit - 0.5 * (before + behind) ** 2, jnp.where(before > 0, -config.miss, 0.0))
+        ratio = jnp.where(moving[index], jnp.minimum(ratio, 0.0), ratio)
+        is_seen = inside & (z > NEAREST_DEPTH) & (nearest > 0)
+        return jnp.where(is_seen, ratio, 0.0), jnp.where(is_seen, before, 0.0)
 
-    ratios, free = jax.vmap(compare)((looks.depth, looks.moving, looks.T_previous_look.wxyz_xyz))
-    step = jnp.max(jnp.diff(jax.lax.cummax(free), axis=0, prepend=0.0), axis=0)
-    standing, drifting = jnp.sum(ratios, axis=0), config.hit - 0.5 * step**2
-    log_odds = jnp.where(view.valid, config.prior + jnp.maximum(standing, drifting), 0.0)
-    most = config.miss * looks.depth.shape[0]
-    limited = jnp.clip(log_odds, -most, most)
-    return view.valid & (_box_sum(limited, camera, config.radius) < 0) & (estimate.depth_noise > 0)
+    return evidence
+
+
+def _moves(
+    is_told: Bool[Array, "p"],
+    log_odds: Float[Array, "p"],
+    step: Float[Array, "p"],
+    camera: Camera,
+    config: MotionConfig,
+) -> Bool[Array, "p"]:
+    """Which pixels of a frame move, by the sum of what looks say of them, averaged over neighbours.
+
+    Depths of a network drift: what stands comes nearer by some percent a frame, until all older looks see through it.
+    What moves leaves free space from one look to the next. With j the largest step, in standard deviations, of the free
+    space behind a point from one look to the one that is farther in time, the log-odds of static are
+    prior + hit - j²/2 at least.
+    """
+    drifting = config.hit - 0.5 * step**2
+    found = jnp.where(is_told, config.prior + jnp.maximum(log_odds, drifting), 0.0)
+    most = config.miss * config.num_looks
+    return is_told & (_box_sum(jnp.clip(found, -most, most), camera, config.radius) < 0)
 
 
 def _box_sum(values: Float[Array, "p"], camera: Camera, radius: int) -> Float[Array, "p"]:

@@ -9,7 +9,15 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.em import EmConfig, EmInfo, em_update, owners
-from emgs_jax.existence import ExistenceConfig, Look, fusion_evidence, merge_duplicates, update_existence
+from emgs_jax.existence import (
+    ExistenceConfig,
+    Look,
+    Seen,
+    fusion_evidence,
+    merge_duplicates,
+    take_back,
+    update_existence,
+)
 from emgs_jax.gaussian_map import (
     AverageConfig,
     GaussianMap,
@@ -24,7 +32,7 @@ from emgs_jax.gaussian_map import (
 from emgs_jax.gaussians import FitConfig, GaussianIndex, Gaussians, cluster, index_of, spacing
 from emgs_jax.initialization import initialize
 from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
-from emgs_jax.motion import Looks, MotionConfig, find_movers, look_again, no_looks
+from emgs_jax.motion import Looks, MotionConfig, as_seen, find_movers, look_again, look_back, no_looks
 from emgs_jax.observation import (
     Observation,
     ObservationConfig,
@@ -121,6 +129,7 @@ class StepInfo(eqx.Module):
         origin: median birth of the Gaussians that explain its points, its own if none do.
         num_left_out: points of the current frame that no map can hold, or with a number that is not finite.
         moving: pixels of the thinned image that are taken for moving.
+        seen: the earlier frame of which no later one will say any more what moved in it.
     """
 
     T_world_camera: jaxlie.SE3
@@ -133,6 +142,7 @@ class StepInfo(eqx.Module):
     num_left_out: Int[Array, ""]
     moving: Bool[Array, "h w"]
     overflow: Overflow
+    seen: Seen | None = None
 
 
 class Submap(eqx.Module):
@@ -240,7 +250,8 @@ def _first_state(
     map, _, overflow = insert(empty_map(config.submap.map_capacity, world.features.shape[-1]), new)
     last, pose, looks = jax.tree.map(lambda leaf: leaf[-1], world), pose_row(sound_poses(T_world_views), -1), None
     if (before := no_looks(last, config.motion)) is not None:
-        looks = look_again(before, last, jnp.zeros(last.valid.shape, bool), pose, pose, view)
+        still = jnp.zeros(last.valid.shape, bool)
+        looks = look_again(before, last, still, pose, time - 1, view)
     state = SlamState(map, last, pose, exact_estimate(), time, looks)
     return state, overflow
 
@@ -269,7 +280,8 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
     refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement)
     new = NewGaussians(fresh, weight, fused.halves)
-    map, num_gaussians, overflow, time = _store(state.map, replace(submap, map=refined), new, frame, view, config)
+    looks, seen = _look(state.looks, frame, state.T_world_previous, view, config.motion)
+    map, num_gaussians, overflow, time = _store(state.map, replace(submap, map=refined), new, frame, seen, view, config)
 
     info = StepInfo(
         T_world_camera=frame.T_world_camera,
@@ -282,8 +294,8 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         num_left_out=num_left_out,
         moving=moving.reshape(view.height, view.width),
         overflow=Overflow(overflow, submap.overflow, refinement.overflow),
+        seen=seen,
     )
-    looks = None if state.looks is None else _look(state.looks, frame, state.T_world_previous, view)
     return SlamState(map, frame.points, frame.T_world_camera, frame.localization.estimate, time, looks), info
 
 
@@ -337,8 +349,17 @@ def _find_movers(
 
 
 @executable
-def _look(looks: Looks, frame: Frame, T_world_previous: jaxlie.SE3, view: Camera) -> Looks:
-    return look_again(looks, frame.seen, frame.moving, frame.T_world_camera, T_world_previous, view)
+def _look(
+    looks: Looks | None, frame: Frame, T_world_previous: jaxlie.SE3, view: Camera, config: MotionConfig
+) -> tuple[Looks | None, Seen | None]:
+    """The looks after a frame, and the one that is none any more, as the frames after it show it."""
+    if looks is None:
+        return None, None
+    estimate, T = frame.localization.estimate, frame.T_world_camera
+    told = look_back(looks, frame.seen, frame.moving, T, T_world_previous, estimate, view, config)
+    after, is_over = look_again(told, frame.seen, frame.moving, T, frame.time, view), jnp.any(frame.seen.valid)
+    oldest = as_seen(told, -1, T, estimate.depth_noise)
+    return after, oldest._replace(moves=oldest.moves & is_over, time=jnp.where(is_over, oldest.time, -1))
 
 
 @executable
@@ -397,6 +418,7 @@ def _store(
     submap: Submap,
     new: NewGaussians,
     frame: Frame,
+    seen: Seen | None,
     view: Camera,
     config: SlamConfig,
 ) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
@@ -408,6 +430,8 @@ def _store(
     rows, T, noise = submap.rows, frame.T_world_camera, frame.localization.depth_noise
     evidence, map = fusion_evidence(map, submap.map, rows), write_back(map, submap.map, rows)
     map, is_seen = update_existence(map, evidence, Look(frame.seen, T, view, noise), config.existence)
+    if seen is not None:
+        map = take_back(map, seen, view, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
     merged = merge_duplicates(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
     born = new_map(new.gaussians, _first_weight(new.weight, config.em.average), config.existence.birth, frame.time)
