@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.existence import Seen
 from emgs_jax.observation import Observation, depth_range
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
 from emgs_jax.ops.precision import full_precision
@@ -53,14 +52,14 @@ class Looks(eqx.Module):
         T_previous_look: of each camera, in that of the last frame: however the map moves, they stay as they are.
     """
 
-    points: Float[Array, "k p 3"]
-    depth: Float[Array, "k 2 p"]
-    said: Bool[Array, "k p"]
-    moving: Bool[Array, "k p"]
-    log_odds: Float[Array, "k p"]
-    free: Float[Array, "k p"]
-    step: Float[Array, "k p"]
-    time: Int[Array, "k"]
+    points: Float[Array, "*k p 3"]
+    depth: Float[Array, "*k 2 p"]
+    said: Bool[Array, "*k p"]
+    moving: Bool[Array, "*k p"]
+    log_odds: Float[Array, "*k p"]
+    free: Float[Array, "*k p"]
+    step: Float[Array, "*k p"]
+    time: Int[Array, "*k"]
     T_previous_look: jaxlie.SE3
 
 
@@ -85,6 +84,15 @@ def no_looks(view: Observation, config: MotionConfig) -> Looks | None:
         time=jnp.full(config.num_looks, -1, jnp.int32),
         T_previous_look=jaxlie.SE3(poses),
     )
+
+
+def forget(looks: Looks | None) -> Looks | None:
+    """No looks instead of some: from where they were seen is not known in the map in which the camera goes on."""
+    if looks is None:
+        return None
+    nothing = jax.tree.map(jnp.zeros_like, looks)
+    poses = jaxlie.SE3(jnp.zeros_like(looks.T_previous_look.wxyz_xyz).at[:, 0].set(1.0))
+    return replace(nothing, time=jnp.full_like(looks.time, -1), T_previous_look=poses)
 
 
 @full_precision
@@ -156,13 +164,6 @@ def look_again(
     )
     is_look = jnp.any(view.valid)
     return jax.tree.map(lambda new, old: jnp.where(is_look, jnp.concatenate([new[None], old[:-1]]), old), newest, looks)
-
-
-def as_seen(looks: Looks, row: int, T_world_last: jaxlie.SE3, depth_noise: Float[Array, ""]) -> Seen:
-    """A look as what later frames have found that it saw; `depth_noise` is that of the last frame."""
-    look = jax.tree.map(lambda leaf: leaf[row], looks)
-    moves = look.moving & ~look.said
-    return Seen(look.depth, moves, T_world_last @ look.T_previous_look, depth_noise, look.time)
 
 
 @full_precision

@@ -32,7 +32,7 @@ from emgs_jax.gaussian_map import (
 from emgs_jax.gaussians import FitConfig, GaussianIndex, Gaussians, cluster, index_of, spacing
 from emgs_jax.initialization import initialize
 from emgs_jax.localization import CoarsePose, LocalizationConfig, LocalizationInfo, localize_coarse, localize_fine
-from emgs_jax.motion import Looks, MotionConfig, as_seen, find_movers, look_again, look_back, no_looks
+from emgs_jax.motion import Looks, MotionConfig, find_movers, look_again, look_back, no_looks
 from emgs_jax.observation import (
     Observation,
     ObservationConfig,
@@ -358,8 +358,15 @@ def _look(
     estimate, T = frame.localization.estimate, frame.T_world_camera
     told = look_back(looks, frame.seen, frame.moving, T, T_world_previous, estimate, view, config)
     after, is_over = look_again(told, frame.seen, frame.moving, T, frame.time, view), jnp.any(frame.seen.valid)
-    oldest = as_seen(told, -1, T, estimate.depth_noise)
+    oldest = as_seen(jax.tree.map(lambda leaf: leaf[-1], told), T, estimate.depth_noise)
     return after, oldest._replace(moves=oldest.moves & is_over, time=jnp.where(is_over, oldest.time, -1))
+
+
+@full_precision
+def as_seen(look: Looks, T_world_last: jaxlie.SE3, depth_noise: Float[Array, ""]) -> Seen:
+    """One look as what later frames have found that it saw; `depth_noise` is that of the last frame."""
+    moves = look.moving & ~look.said
+    return Seen(look.depth, moves, T_world_last @ look.T_previous_look, depth_noise, look.time)
 
 
 @executable

@@ -1,16 +1,19 @@
 """What is seen through goes and what is seen stays; two layers of a surface become one, and two surfaces do not."""
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
 from scene import assert_same, at, device, flat_gaussians, fresh_map, join, on_host, pose, replace, rows_of
 
 from emgs_jax.existence import (
     Look,
+    Seen,
     depth_range,
     fusion_evidence,
     merge_all_duplicates,
     merge_duplicates,
+    take_back,
     update_existence,
 )
 from emgs_jax.gaussian_map import GaussianMap, confirmed
@@ -19,8 +22,8 @@ from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera
 
 NUM_ROWS = 1200  # of every map, most of them free: one program for all
-judged_map, joined_map, merged_map, ranges = (
-    on_host(f) for f in (update_existence, merge_duplicates, merge_all_duplicates, depth_range)
+judged_map, corrected_map, joined_map, merged_map, ranges = (
+    on_host(f) for f in (update_existence, take_back, merge_duplicates, merge_all_duplicates, depth_range)
 )
 CAMERA = Camera([40.0, 44.0], [31.5, 23.5], 64, 48)
 NOISE = device(0.02)
@@ -348,3 +351,32 @@ def test_a_frame_that_is_not_tracked_says_nothing(settings):
     after, is_seen = judged(map, -1, look(3.0, valid=False), HERE, CAMERA, device(0.0), settings)
     assert_same(after, rows_of(map, slice(None)))
     assert not is_seen.any()
+
+
+def test_what_a_frame_has_said_where_something_moved_is_taken_back(settings):
+    """A block at 2 m before a wall at 3 m has moved in the left half of a frame: what else it has seen stays."""
+    rows, columns = np.indices((48, 64))
+    depth = np.where(abs(columns - 31.5) < 20, 2.0, 3.0)
+    depths = ranges(look(depth), HERE, CAMERA)
+    moves = (columns < 31).reshape(-1)
+    places = {  # mean, normal: what is taken back
+        "moved": ((-0.5, 0.0, 2.0), (0, 0, -1), True),
+        "within the noise": ((-0.5, 0.2, 2.05), (0, 0, -1), True),
+        "stands": ((0.5, 0.0, 2.0), (0, 0, -1), False),
+        "before it": ((-0.5, 0.0, 1.5), (0, 0, -1), False),
+        "hidden by it": ((-0.5, 0.0, 3.0), (0, 0, -1), False),
+        "too grazing to be seen": ((-0.5, 0.1, 2.0), (0, 1, 0), False),
+        "behind the camera": ((-0.5, 0.0, -2.0), (0, 0, -1), False),
+        "in no pixel with a depth": ((-1.3, -0.9, 2.9), (0, 0, -1), False),
+    }
+    depths = np.where((columns < 20) & (rows < 15), 0.0, depths.reshape(2, 48, 64)).reshape(2, -1)
+    parts = [discs([mean], normal) for mean, normal, _ in places.values()]
+    seen = Seen(depths, moves, HERE, NOISE, np.int32(3))
+    for existence in (2.0, settings.refuted + 0.1):
+        before = filled(map_of(*parts, existence=existence))
+        after = rows_of(corrected_map(before, jax.tree.map(device, seen), CAMERA, settings), slice(len(places)))
+        is_back = np.array([back for *_, back in places.values()])
+        lost = np.where(is_back, settings.hit + settings.miss, 0.0)
+        gone = is_back & (existence - lost < settings.refuted)
+        np.testing.assert_allclose(after.existence[~gone], (existence - lost)[~gone], rtol=1e-6)
+        np.testing.assert_array_equal(after.gaussians.valid, ~gone)

@@ -1,21 +1,23 @@
 """What stands where earlier frames looked through moves; what does not, or is only wrong, does not."""
 
 import equinox as eqx
+import jax
 import numpy as np
 import pytest
-from scene import device, on_host, pose, replace
+from scene import assert_same, device, on_host, pose, replace
 
-from emgs_jax.motion import Looks, find_movers, look_again, no_looks
+from emgs_jax.motion import Looks, find_movers, forget, look_again, look_back, no_looks
 from emgs_jax.observation import Observation, transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.pose_estimate import exact_estimate
+from emgs_jax.slam import as_seen
 
 CAMERA = Camera([40.0, 44.0], [31.5, 23.5], 64, 48)
 WALL, NUM_LOOKS = np.full((48, 64), 3.0), 12
 ROWS, COLUMNS = np.indices((48, 64))
 BLOCK = (abs(ROWS - 24) < 12) & (abs(COLUMNS - 30) < 9)
 NOTHING = np.zeros((48, 64), bool)
-moved, looked = (on_host(f) for f in (find_movers, look_again))
+moved, told, looked = (on_host(f) for f in (find_movers, look_back, look_again))
 
 
 @pytest.fixture(scope="module")
@@ -36,19 +38,28 @@ def with_block(depth=2.0, where=BLOCK, wall=WALL):
     return np.where(where, depth, wall)
 
 
-def after(views, settings, masks=(), poses=()) -> Looks:
-    """Looks at depth images, oldest first, with what was taken for moving in them, from poses in the world."""
-    looks, last = no_looks(seen(WALL), settings), pose()
+def estimated(noise=0.02, std=0.0):
+    return replace(exact_estimate(), depth_noise=device(noise), covariance=device(std**2 * np.eye(7)))
+
+
+def after(views, settings, masks=(), poses=(), **errors) -> Looks:
+    """Looks at depth images, oldest first, with what was taken for moving in them, from poses in the world.
+
+    Without `errors` later frames say nothing of the earlier ones.
+    """
+    looks, last, estimate = no_looks(seen(WALL), settings), pose(), estimated(**(errors or {"noise": 0.0}))
     for number, depth in enumerate(views):
         T = poses[number] if len(poses) else pose()
         mask = device((masks[number] if len(masks) else NOTHING).reshape(-1))
-        looks, last = look_again(looks, transform(T, seen(depth), device(1.0)), mask, T, last, CAMERA), T
+        view, time = transform(T, seen(depth), device(1.0)), device(np.int32(number))
+        looks = look_back(looks, view, mask, T, last, estimate, CAMERA, settings)
+        looks, last = look_again(looks, view, mask, T, time, CAMERA), T
     return looks
 
 
 def found(looks, depth, settings, noise=0.02, std=0.0, T_previous_camera=None) -> np.ndarray:
     """Image of what moves in a depth image."""
-    estimate = replace(exact_estimate(), depth_noise=device(noise), covariance=device(std**2 * np.eye(7)))
+    estimate = estimated(noise, std)
     T = pose() if T_previous_camera is None else T_previous_camera
     return moved(looks, seen(depth), T, estimate, CAMERA, settings).reshape(48, 64)
 
@@ -109,9 +120,73 @@ def test_free_space_decides_what_moves(case, settings):
     if case == "a place that no look shows":
         looks = eqx.tree_at(lambda k: k.depth, looks, np.where(np.asarray(looks.depth) < 0.5, 0.0, looks.depth))
     said = found(looks, now, settings, **{key: value for key, value in more.items() if key != "masks"})
+    assert_alike(said, expected)
+
+
+def assert_alike(said, expected):
     kernel = np.lib.stride_tricks.sliding_window_view(np.pad(expected, 2, mode="edge"), (5, 5))
     is_sure = kernel.all((2, 3)) | ~kernel.any((2, 3))  # the outline may be either
     np.testing.assert_array_equal(said[is_sure], expected[is_sure])
+
+
+def one_of(looks, row) -> Looks:
+    return jax.tree.map(lambda leaf: leaf[row], looks)
+
+
+LATER = {  # depth images, in the first of which pixels have moved as the others show
+    "nothing": ([WALL] * 6, {}, NOTHING),
+    "a block that leaves": ([HERE] * 3 + [WALL] * 8, {}, BLOCK),
+    "one that walks on": (walking(10), {}, np.roll(BLOCK, -20, axis=1)),
+    "one that stands to the end": ([HERE] * 6, {}, NOTHING),
+    "one that comes": ([WALL] * 3 + [HERE] * 6, {}, NOTHING),
+    "a wrong prediction: a block that one frame does not show": ([HERE] * 2 + [WALL] + [HERE] * 4, {}, NOTHING),
+    "a block that is hidden": ([HERE] * 2 + [with_block(1.0)] * 8, {}, NOTHING),
+    "one that had moved by the looks before it": ([HERE] * 6, {"masks": [BLOCK] + [NOTHING] * 5}, BLOCK),
+    "one that others take for moving where it stands": (
+        [HERE] * 4 + [WALL] * 4,
+        {"masks": [NOTHING] + [BLOCK] * 3 + [NOTHING] * 4},
+        BLOCK,
+    ),
+    "as little as one look": ([HERE, WALL], {}, NOTHING),
+    "farther in each frame: a drift": ([WALL * 1.03**step for step in range(12)], {}, NOTHING),
+    "a noise that is not known": ([HERE] * 3 + [WALL] * 8, {"noise": 0.0}, NOTHING),
+    "a pose that is not known": ([HERE] * 3 + [WALL] * 8, {"std": 0.5}, NOTHING),
+}
+
+
+@pytest.mark.parametrize("case", LATER)
+def test_later_frames_decide_what_has_moved(case, settings):
+    views, more, expected = LATER[case]
+    looks = after(
+        views, settings, more.get("masks", ()), **({"noise": 0.02} | {k: v for k, v in more.items() if k != "masks"})
+    )
+    first = len(views) - 1
+    assert_alike(np.asarray(looks.moving[first]).reshape(48, 64), expected)
+    assert looks.time[first] == 0 and looks.time[0] == first
+    told_before = np.asarray(looks.said[first]).reshape(48, 64)
+    seen_by_then = as_seen(one_of(looks, first), pose(), device(0.02))
+    assert_alike(np.asarray(seen_by_then.moves).reshape(48, 64), expected & ~told_before)
+
+
+def test_a_look_is_told_where_it_was_seen_from_and_what_has_moved_in_it_supports_nothing_there(settings):
+    """A wall is crossed by a camera that goes; what left in the first look does not say that a block stands there."""
+    poses = [pose((0.0, 0.01 * step, 0.0), (0.02 * step, 0.0, 0.0)) for step in range(6)]
+    looks = after([WALL] * 6, settings, (), poses, noise=0.02)
+    for row in range(6):
+        seen_then = as_seen(one_of(looks, row), poses[-1], device(0.02))
+        expected = poses[5 - row].as_matrix()
+        np.testing.assert_allclose(seen_then.T_world_camera.as_matrix(), expected, atol=1e-5)
+        assert seen_then.time == 5 - row and seen_then.depth.shape == (2, 48 * 64)
+    stood = [HERE] * 3 + [WALL] * 5
+    alone = found(after(stood, settings), HERE, settings)
+    informed = found(after(stood, settings, noise=0.02), HERE, settings)
+    assert not alone[BLOCK].all() or informed[BLOCK].all()
+    inner = BLOCK & np.roll(BLOCK, 3, 0) & np.roll(BLOCK, -3, 0) & np.roll(BLOCK, 3, 1) & np.roll(BLOCK, -3, 1)
+    assert informed[inner].all()
+    nothing = forget(after([HERE] * 4, settings, noise=0.02))
+    for name, leaf in vars(no_looks(seen(WALL), settings)).items():
+        assert_same(getattr(nothing, name), leaf)
+    assert forget(None) is None
 
 
 def test_a_camera_that_turns_and_a_map_that_moves_change_nothing_and_an_untracked_frame_is_no_look(settings):
@@ -139,10 +214,13 @@ def test_a_camera_that_turns_and_a_map_that_moves_change_nothing_and_an_untracke
     assert (again != said).mean() < 0.01
     looks = after([WALL] * 3, settings)
     lost = replace(seen(HERE), valid=device(np.zeros(48 * 64, bool)))
-    skipped = looked(looks, lost, device(NOTHING.reshape(-1)), poses[3], pose(), CAMERA)
+    nothing = device(NOTHING.reshape(-1))
+    skipped = told(looks, lost, nothing, poses[3], pose(), estimated(), CAMERA, settings)
+    np.testing.assert_array_equal(skipped.log_odds, looks.log_odds)
+    skipped = looked(skipped, lost, nothing, poses[3], device(np.int32(3)), CAMERA)
     np.testing.assert_array_equal(skipped.depth, looks.depth)
     right = replace(seen(HERE), valid=device((COLUMNS > 9).reshape(-1)))
-    depth = looked(looks, right, device(NOTHING.reshape(-1)), pose(), pose(), CAMERA).depth
+    depth = looked(looks, right, nothing, pose(), device(np.int32(3)), CAMERA).depth
     assert np.isfinite(depth).all() and not depth[0][:, (COLUMNS <= 9).ravel()].any()
     np.testing.assert_allclose(skipped.T_previous_look.wxyz_xyz[0], poses[3].inverse().wxyz_xyz, atol=1e-6)
 

@@ -1,6 +1,7 @@
 """Public functions of the core with arguments of small fixed shapes, for tests of what JAX makes of them."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scene as sc
@@ -26,6 +27,7 @@ from emgs_jax.pose_graph import deform, factors
 from emgs_jax.refinement import refine
 from emgs_jax.registration import icp, noise, pose_estimate, pose_noise, problem, rigid
 from emgs_jax.render import composite, densify, project
+from emgs_jax.slam import as_seen
 
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
 CONFIG = sc.slam_config("slam.submap.map_capacity=48", "slam.submap.submap_capacity=32", "render.tile_capacity=32")
@@ -84,8 +86,11 @@ def looks_of(seed: int) -> motion.Looks:
     looks = motion.no_looks(previous_of(seed), MOTION)
     for number in (0, 1):
         T, moving = sc.path_pose(number + seed), jnp.asarray((ROWS - number) % 7 == 0)
-        looks = motion.look_again(looks, previous_of(seed + number), moving, T, sc.path_pose(seed), CAMERA)
-    return looks
+        view, time = previous_of(seed + number), jnp.asarray(number, jnp.int32)
+        looks = motion.look_back(looks, view, moving, T, sc.path_pose(seed), belief_of(seed), CAMERA, MOTION)
+        looks = motion.look_again(looks, view, moving, T, time, CAMERA)
+    # As after more frames: what is 0 is at a gate.
+    return sc.replace(looks, free=looks.free + 0.5, step=looks.step + 0.2)
 
 
 def estep_of(seed: int) -> em.EStep:
@@ -263,8 +268,18 @@ VERBS = {
         lambda s: (map_of(s), map_of(s + 9).gaussians.means),
     ),
     "look_again": (
-        lambda k, o, T: motion.look_again(k, o, jnp.asarray(ROWS % 5 == 0), T, sc.path_pose(1), CAMERA),
+        lambda k, o, T: motion.look_again(k, o, jnp.asarray(ROWS % 5 == 0), T, jnp.asarray(4, jnp.int32), CAMERA),
         lambda s: (looks_of(s), previous_of(s), sc.path_pose(1 + s)),
+    ),
+    "look_back": (
+        lambda k, o, T, b: motion.look_back(k, o, jnp.asarray(ROWS % 5 == 0), T, sc.path_pose(1), b, CAMERA, MOTION),
+        lambda s: (looks_of(s), previous_of(s), sc.path_pose(1 + s), belief_of(s)),
+    ),
+    "take_back": (
+        lambda m, k, T: existence.take_back(
+            m, as_seen(jax.tree.map(lambda leaf: leaf[1], k), T, ONE * 0.02), CAMERA, CONFIG.existence
+        ),
+        lambda s: (map_of(s), looks_of(s), looking(s)),
     ),
     "find_movers": (
         lambda k, o, T, b: motion.find_movers(k, o, T, b, CAMERA, MOTION),

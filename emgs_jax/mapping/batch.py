@@ -23,7 +23,7 @@ from emgs_jax.mapping.capacity import advance, start
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.event import Event
 from emgs_jax.mapping.integrate import seconds_of, update_graph
-from emgs_jax.mapping.pipeline import finish_run, map_input, with_atlas
+from emgs_jax.mapping.pipeline import finish_run, map_input, with_outcome
 from emgs_jax.mapping.records import records_of
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.mapping.tracking import lost_event, start_event, step_event
@@ -128,7 +128,7 @@ def integrate_stack(group: Stack, window: WindowInput) -> Stack:
 def _with_event(run: MappingRun, window: WindowInput, event: Event) -> MappingRun:
     """Write what became of an input's frames into pose graph and log."""
     run = replace(run, records=(*run.records, *records_of(window, event)))
-    return with_atlas(run, update_graph(run.atlas, window, event))
+    return with_outcome(run, update_graph(run.atlas, window, event), event)
 
 
 def unstacked(group: Stack) -> list[MappingRun]:

@@ -33,7 +33,7 @@ from emgs_jax.registration.pose_noise import Repeats
 from emgs_jax.slam import SlamState
 
 CHECKPOINT_FILE = "checkpoint.npz"
-FORMAT, VERSION = "emgs_jax.checkpoint", 9
+FORMAT, VERSION = "emgs_jax.checkpoint", 10
 OF_MAPS = (Submap, World, SlamState, GaussianMap, Gaussians, Observation, Looks, PoseEstimate, Repeats, jaxlie.SE3)
 OF_GRAPH = (BackEnd, Node, Factor, LoopMeasurement, Refusal, Closure, PoseGraphInfo, Database, Keyframe)
 
@@ -56,7 +56,7 @@ class Checkpoint:
     Args:
         atlas: without camera and config, which the run that resumes has.
         capacities: of the map and the submap of a step.
-        records: as the frames were placed.
+        records: as the frames were placed, and what is known by now to have moved in them.
     """
 
     num_inputs: int
@@ -139,7 +139,11 @@ class Keeper:
         if not self._every or run is None or len(placed) <= self._num_saved:
             return
         capacities = run.config.submap.map_capacity, run.config.submap.submap_capacity
-        save_checkpoint(self.path, Checkpoint(num_inputs, run.atlas, capacities, placed), self._signature)
+        records = [
+            replace(record, moving=known.moving, moving_pixels=known.moving_pixels)
+            for record, known in zip(placed, run.records, strict=True)
+        ]
+        save_checkpoint(self.path, Checkpoint(num_inputs, run.atlas, capacities, records), self._signature)
         self._num_saved = len(placed)
 
     def drop(self) -> None:

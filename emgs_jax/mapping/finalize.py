@@ -1,4 +1,4 @@
-"""The end of a run: its first frame's own covariance, and the unit of the map.
+"""The end of a run: what its last frames saw move, its first frame's own covariance, and the unit of the map.
 
 During a run the unit is that of the first inference, at its end the mean of all inferences'. Covariances of poses are
 relative to the first frame; at the end that one's own is added.
@@ -7,6 +7,7 @@ relative to the first frame; at the end that one's own is added.
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -15,14 +16,43 @@ from jaxtyping import Array, Float
 from emgs_jax.back_end.state import transform_nodes
 from emgs_jax.device.arrays import on_device
 from emgs_jax.device.executables import stored
-from emgs_jax.gaussian_map import transform_rows
+from emgs_jax.existence import ExistenceConfig, Seen, take_back
+from emgs_jax.gaussian_map import GaussianMap, transform_rows
 from emgs_jax.geometry import Sim3, seen_from
 from emgs_jax.localization import LocalizationConfig
 from emgs_jax.mapping.atlas import Atlas, with_state
+from emgs_jax.motion import Looks, forget
 from emgs_jax.observation import Observation, depth_in
+from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.registration.pose_estimate import PoseEstimate, rescale_estimate
 from emgs_jax.registration.pose_noise import LEAST_NOISE, axis_std
-from emgs_jax.slam import SlamState
+from emgs_jax.slam import SlamConfig, SlamState, as_seen
+
+
+def end_looks(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[SlamState, list[Seen]]:
+    """Take back what the last frames have said for Gaussians of things that moved: no later frame will say more.
+
+    Args:
+        camera: of the full images.
+
+    Returns:
+        The state, without looks, and those frames, on the host; none where nothing is taken for moving.
+    """
+    if state.looks is None:
+        return state, []
+    map, seen = _end_looks(state, downscale(camera, config.observation.thin), config.existence)
+    seen = jax.device_get(seen)
+    each = [jax.tree.map(lambda leaf, row=row: leaf[row], seen) for row in np.flatnonzero(seen.time >= 0)]
+    return replace(state, map=map, looks=forget(state.looks)), each
+
+
+@stored
+def _end_looks(state: SlamState, view: Camera, config: ExistenceConfig) -> tuple[GaussianMap, Seen]:
+    def end(map: GaussianMap, look: Looks) -> tuple[GaussianMap, Seen]:
+        seen = as_seen(look, state.T_world_previous, state.estimate.depth_noise)
+        return take_back(map, seen, view, config), seen
+
+    return jax.lax.scan(end, state.map, state.looks, reverse=True)
 
 
 def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:

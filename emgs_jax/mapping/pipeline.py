@@ -7,15 +7,17 @@ from dataclasses import replace
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.device.clock import Timer
-from emgs_jax.mapping.atlas import Atlas, set_unjoined_apart
+from emgs_jax.mapping.atlas import Atlas, set_unjoined_apart, with_state
 from emgs_jax.mapping.capacity import prepare_step
 from emgs_jax.mapping.checkpoint import Keeper
 from emgs_jax.mapping.convert import FirstWindow
-from emgs_jax.mapping.finalize import rescale_atlas, with_first_frame
+from emgs_jax.mapping.event import Event
+from emgs_jax.mapping.finalize import end_looks, rescale_atlas, with_first_frame
 from emgs_jax.mapping.integrate import finish_back_end, integrate, seconds_of
-from emgs_jax.mapping.records import FrameRecord, records_of, with_moved_nodes, with_unjoined_apart
+from emgs_jax.mapping.records import FrameRecord, records_of, with_moved_nodes, with_moved_pixels, with_unjoined_apart
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.mapping.window_input import RawView, WindowInput, make_prior_query, window_inputs
+from emgs_jax.ops.camera import downscale
 from emgs_jax.prior.base import Prior
 
 
@@ -78,7 +80,16 @@ def map_input(run: MappingRun, window: WindowInput) -> tuple[MappingRun, Sequenc
         window = replace(window, seconds=seconds_of(window, timer))
     atlas, event = integrate(run.atlas, window, run.prior_query, run.clock)
     records = records_of(window, event)
-    return with_atlas(replace(run, records=(*run.records, *records)), atlas), records
+    return with_outcome(replace(run, records=(*run.records, *records)), atlas, event), records
+
+
+def with_outcome(run: MappingRun, atlas: Atlas, event: Event) -> MappingRun:
+    """Set the atlas of a run with the records of an input, and write what it says of earlier frames into its log."""
+    if event.info is None or event.info.seen is None:
+        return with_atlas(run, atlas)
+    time = int(atlas.state.time) - 1
+    records = with_moved_pixels(run.records, event.info.seen, time, event.info.moving.shape)
+    return with_atlas(replace(run, records=records), atlas)
 
 
 def with_atlas(run: MappingRun, atlas: Atlas) -> MappingRun:
@@ -88,15 +99,28 @@ def with_atlas(run: MappingRun, atlas: Atlas) -> MappingRun:
 
 def finish_run(run: MappingRun, is_interrupted: bool = False) -> MappingRun:
     """Complete a run after its last input; one that was interrupted gets the same unit, and is not optimized again."""
+    time = 0 if run.state is None else int(run.state.time) - 1
     atlas = set_unjoined_apart(run.atlas)
     if len(atlas.submaps) > 1:
         records = with_unjoined_apart(run.records, atlas.graph.nodes, atlas.graph.active)
         run = replace(run, atlas=atlas, records=records)
+    run = with_looks_ended(replace(run, atlas=atlas), time)
     if run.back_end is not None and not atlas.is_frozen and not is_interrupted:
         with run.clock.phase("back_end"):
-            run = with_atlas(run, finish_back_end(atlas, run.prior_query))
+            run = with_atlas(run, finish_back_end(run.atlas, run.prior_query))
     if not run.records:
         return run
     first = run.records[0].pose
     atlas, own = with_first_frame(run.atlas, first)
     return replace(with_atlas(run, rescale_atlas(atlas, first)), first_covariance=own)
+
+
+def with_looks_ended(run: MappingRun, time: int) -> MappingRun:
+    """Apply `end_looks` to a run after its last input; `time` is that of the frame of its last record."""
+    if run.state is None:
+        return run
+    state, all_seen = end_looks(run.state, run.camera, run.config)
+    view, records = downscale(run.camera, run.config.observation.thin), run.records
+    for seen in all_seen:
+        records = with_moved_pixels(records, seen, time, (view.height, view.width))
+    return replace(run, atlas=with_state(run.atlas, state, run.config), records=records)

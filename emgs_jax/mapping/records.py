@@ -14,7 +14,8 @@ from tqdm import tqdm
 
 from emgs_jax.back_end.state import Node
 from emgs_jax.device.arrays import to_matrix
-from emgs_jax.io.run_lengths import to_run_lengths
+from emgs_jax.existence import Seen
+from emgs_jax.io.run_lengths import from_run_lengths, to_run_lengths
 from emgs_jax.io.trajectory import to_tum
 from emgs_jax.localization import REASONS
 from emgs_jax.mapping.event import JOINED, NEW_SUBMAP, RESTARTED, Event
@@ -80,7 +81,7 @@ class FrameRecord:
         origin: frame whose Gaussians it was registered to (median of their births), counted from the map's first one.
         repeat_rms: robust standard deviation between the two predictions of the previous image, m.
         left_out: pixels with a prediction that is not finite, behind the camera or farther than a map can hold.
-        moving: share of the pixels that are taken for moving.
+        moving: share of the pixels that are taken for moving, also by frames that came later.
         moving_pixels: which of the thinned image, see `to_run_lengths`; None where none is.
         fused: points that moved Gaussians.
         updated: Gaussians that they moved.
@@ -225,6 +226,23 @@ def with_unjoined_apart(records: Sequence[FrameRecord], nodes: Sequence[Node], k
             status = APART if record.status in IN_MAP else "lost"
             known = {"status": status, "reason": UNJOINED, "submap": node.submap, "covariance": node.covariance}
             found[first + row] = replace(record, **known)
+    return tuple(found)
+
+
+def with_moved_pixels(records: Sequence[FrameRecord], seen: Seen, time: int, shape: tuple[int, int]) -> Sequence:
+    """Write what later frames have shown to have moved in an earlier one into its record.
+
+    Args:
+        seen: that frame, on the host.
+        time: of the frame of the last record, see `SlamState`.
+        shape: (h, w) of the thinned image.
+    """
+    if not seen.moves.any():
+        return records
+    found, row, moves = list(records), len(records) - 1 - (time - int(seen.time)), seen.moves.reshape(shape)
+    known = found[row].moving_pixels
+    moves = moves if known is None else moves | from_run_lengths(known)
+    found[row] = replace(found[row], moving=float(np.mean(moves)), moving_pixels=to_run_lengths(moves))
     return tuple(found)
 
 

@@ -20,6 +20,7 @@ from emgs_jax.mapping.capacity import advance, restart_map, start
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.event import JOINED, NEW_SUBMAP, RELOCALIZED, RESTARTED, Event
 from emgs_jax.mapping.window_input import WindowInput
+from emgs_jax.motion import forget
 from emgs_jax.observation import Prediction, depth_in, no_covariance, transform, unknown_scale
 from emgs_jax.registration.rigid import pose_row, scale_translation
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
@@ -221,7 +222,8 @@ def return_to_world(atlas: Atlas, window: WindowInput) -> Atlas:
     previous = replace(submap.state.previous, valid=jnp.zeros_like(submap.state.previous.valid))
     atlas = replace(_with_world_left(atlas), graph=replace(atlas.graph, active=number))
     atlas = replace(atlas, world=submap.worlds[window.world])
-    return with_state(atlas, replace(atlas.state, previous=previous, time=time), atlas.config)
+    state = replace(atlas.state, previous=previous, time=time, looks=forget(atlas.state.looks))
+    return with_state(atlas, state, atlas.config)
 
 
 def _step(atlas: Atlas, window: WindowInput) -> tuple[Atlas, StepInfo | None]:
@@ -351,9 +353,8 @@ def relocalized_start(
     estimate = replace(state.estimate, covariance=covariance)
     if not is_same_unit:
         estimate = replace(estimate, log_scale=log_scale)
-    return replace(
-        state, previous=transform(T, prediction.current, scale), T_world_previous=T, estimate=estimate
-    ), again
+    previous, looks = transform(T, prediction.current, scale), forget(state.looks)
+    return replace(state, previous=previous, T_world_previous=T, estimate=estimate, looks=looks), again
 
 
 def rejection(
