@@ -337,6 +337,17 @@ def test_of_both_searches_the_cheaper_one_is_taken():
     assert costs[1] <= costs[0] * (1 + 1e-9)
 
 
+def test_without_damping_at_the_start_a_step_that_fails_is_damped():
+    """0 stayed 0: the same step was tried again until no iteration was left."""
+    truth = walk(20, laps=1.0)
+    given = disturb(truth, np.random.default_rng(1), np.array([3.0] * 3 + [1.5] * 3 + [0.0]))
+    graph = PoseGraph(given, join(measure(truth, window_pairs(20)), measure_loops(truth, [(0, 19), (1, 18)])))
+    free = {"start": "current", "kernel": np.inf, "max_iterations": 200}
+    nodes, info = optimize(graph, config(damping=0.0, **free))
+    assert info.converged and not info.reason
+    np.testing.assert_allclose(error(nodes, truth), 0.0, atol=1e-6)
+
+
 def test_a_step_that_costs_more_is_not_taken():
     """From far away, undamped: more steps never cost more, and some of them are refused."""
     truth = walk(30, laps=1.0)
