@@ -86,15 +86,6 @@ def no_looks(view: Observation, config: MotionConfig) -> Looks | None:
     )
 
 
-def forget(looks: Looks | None) -> Looks | None:
-    """No looks instead of some: from where they were seen is not known in the map in which the camera goes on."""
-    if looks is None:
-        return None
-    nothing = jax.tree.map(jnp.zeros_like, looks)
-    poses = jaxlie.SE3(jnp.zeros_like(looks.T_previous_look.wxyz_xyz).at[:, 0].set(1.0))
-    return replace(nothing, time=jnp.full_like(looks.time, -1), T_previous_look=poses)
-
-
 @full_precision
 def look_back(
     looks: Looks,

@@ -21,7 +21,7 @@ from emgs_jax.gaussian_map import grow
 from emgs_jax.geometry import Sim3, scale_covariance, scale_pose
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
 from emgs_jax.mapping.capacity import add_map
-from emgs_jax.motion import forget, no_looks
+from emgs_jax.motion import no_looks
 from emgs_jax.observation import Observation
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.registration.pose_estimate import exact_estimate, rescale_estimate
@@ -137,7 +137,7 @@ def join_at(atlas: Atlas, similarity: Sim3, place: RelocalizedPose) -> Atlas:
     state = deform_state(atlas.state, before, after, min_std, deform)
     moved = move_map(atlas.submaps[there].state.map, before, after, jnp.asarray(min_std, jnp.float32), deform)
     map, config = add_map(state.map, moved, atlas.config)
-    state = replace(state, map=map, looks=forget(state.looks))  # its unit may be another one
+    state = replace(state, map=map)
     if here == newer:
         state = replace(state, estimate=rescale_estimate(state.estimate, jnp.asarray(motion.scale, jnp.float32)))
     # Where another world of the prior lies in a submap that moves is not known any more.

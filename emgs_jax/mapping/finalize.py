@@ -13,7 +13,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from emgs_jax.back_end.state import transform_nodes
+from emgs_jax.back_end.state import BackEnd, transform_nodes
 from emgs_jax.device.arrays import on_device
 from emgs_jax.device.executables import stored
 from emgs_jax.existence import ExistenceConfig, Seen, take_back
@@ -21,7 +21,7 @@ from emgs_jax.gaussian_map import GaussianMap, transform_rows
 from emgs_jax.geometry import Sim3, seen_from
 from emgs_jax.localization import LocalizationConfig
 from emgs_jax.mapping.atlas import Atlas, with_state
-from emgs_jax.motion import Looks, forget
+from emgs_jax.motion import Looks
 from emgs_jax.observation import Observation, depth_in
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.registration.pose_estimate import PoseEstimate, rescale_estimate
@@ -43,7 +43,7 @@ def end_looks(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[Sla
     map, seen = _end_looks(state, downscale(camera, config.observation.thin), config.existence)
     seen = jax.device_get(seen)
     each = [jax.tree.map(lambda leaf, row=row: leaf[row], seen) for row in np.flatnonzero(seen.time >= 0)]
-    return replace(state, map=map, looks=forget(state.looks)), each
+    return replace(state, map=map, looks=None), each
 
 
 @stored
@@ -96,7 +96,7 @@ def with_first_frame(atlas: Atlas, first: np.ndarray) -> tuple[Atlas, np.ndarray
         The atlas, and what was added of the first frame; None: nothing.
     """
     graph = atlas.graph
-    rows = [row for row, node in enumerate(graph.nodes) if node.covariance is not None]
+    rows = [row for row in _active_rows(graph) if graph.nodes[row].covariance is not None]
     if atlas.state is None or graph.first_node or not rows:
         return atlas, None
     own = own_covariance(atlas.state, atlas.config.localization)
@@ -106,6 +106,11 @@ def with_first_frame(atlas: Atlas, first: np.ndarray) -> tuple[Atlas, np.ndarray
     for row, added in zip(rows, seen_from(own, first, np.stack([nodes[row].pose for row in rows])), strict=True):
         nodes[row] = replace(nodes[row], covariance=nodes[row].covariance + added)
     return replace(atlas, graph=replace(graph, nodes=tuple(nodes))), own
+
+
+def _active_rows(graph: BackEnd) -> list[int]:
+    """Nodes of the active submap; the others are in worlds and units of their own."""
+    return [row for row, node in enumerate(graph.nodes) if node.submap == graph.active]
 
 
 def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
@@ -127,13 +132,14 @@ def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
 def rescale_atlas(atlas: Atlas, first: np.ndarray) -> Atlas:
     """Apply `in_prior_unit` to a run that ends, its pose graph included, about the `first` camera's pose (4, 4).
 
-    A saved map keeps its unit, and so does one of joined submaps: the mean is of the last one's inferences.
+    A saved map keeps its unit, and so does one of joined submaps: the mean is of the last one's inferences. Submaps
+    that were never joined stay, poses and maps, in the worlds that they have.
     """
     graph, state = atlas.graph, atlas.state
     if state is None or graph.first_node or not graph.has_one_unit or not state.estimate.log_scale:
         return atlas
     similarity = Sim3.about(first[:3, 3], np.exp(-float(state.estimate.log_scale)))
-    graph = transform_nodes(graph, range(len(graph.nodes)), similarity)
+    graph = transform_nodes(graph, _active_rows(graph), similarity)
     return with_state(replace(atlas, graph=graph), in_prior_unit(state, first[:3, 3]), atlas.config)
 
 

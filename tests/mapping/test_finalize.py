@@ -9,14 +9,17 @@ import jaxlie
 import numpy as np
 import pytest
 from hand_run import run_of
-from scene import pose, random_gaussians, random_observation, slam_config
+from scene import flat_gaussians, pose, random_gaussians, random_observation, slam_config
 
 from emgs_jax.gaussian_map import new_map
+from emgs_jax.io.run_lengths import from_run_lengths, to_run_lengths
 from emgs_jax.mapping.finalize import own_covariance, with_first_frame
-from emgs_jax.mapping.pipeline import with_atlas
+from emgs_jax.mapping.pipeline import with_atlas, with_looks_ended
 from emgs_jax.mapping.records import FrameRecord, to_line
 from emgs_jax.mapping.run import MappingRun
+from emgs_jax.motion import no_looks
 from emgs_jax.observation import transform
+from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.report.run_files import save_progress
 from emgs_jax.slam import SlamState
@@ -92,7 +95,51 @@ def test_the_file_of_the_frames_says_it_too(tmp_path):
         assert np.max(line["covariance"]) > 2e-4
 
 
+def test_frames_of_a_submap_that_was_never_joined_are_not_relative_to_the_first_frame():
+    atlas = a_run().atlas
+    nodes = [*atlas.graph.nodes[:2], *(replace(node, submap=1) for node in atlas.graph.nodes[2:])]
+    found, own = with_first_frame(replace(atlas, graph=replace(atlas.graph, nodes=tuple(nodes))), np.eye(4))
+    assert own.any() and found.graph.nodes[1] is not nodes[1] and found.graph.nodes[2] is nodes[2]
+
+
 def test_poses_in_a_saved_map_are_not_relative_to_a_first_frame():
     atlas = a_run().atlas
     atlas = replace(atlas, graph=replace(atlas.graph, first_node=1))
     assert with_first_frame(atlas, np.eye(4)) == (atlas, None)
+
+
+def test_what_the_last_frames_saw_move_is_taken_out_of_the_map_and_written_into_their_records():
+    """A frame before the last two has seen nine Gaussians where, as these show, something moved; eight others not."""
+    config = slam_config("slam.observation.thin=1", "slam.motion.num_looks=3", "slam/existence=default")
+    camera, depth = Camera([20.0, 20.0], [7.5, 5.5], 16, 12), 2.0
+    columns = np.indices((12, 16))[1].reshape(-1)
+    there = (np.indices((12, 16)).reshape(2, -1).T[:, ::-1] - [7.5, 5.5]) / 20.0 * depth
+    means = np.concatenate([there, np.full((192, 1), depth)], axis=1)
+    gaussians = flat_gaussians(means, 0.02, (0.0, 0.0, -1.0), 0.003)
+    map = new_map(gaussians, jnp.ones(192), jnp.ones(()) * 0.5, jnp.asarray(0))
+    poses = [np.eye(4)] * 4
+    records = [FrameRecord(i, None, None, "tracked", pose=pose, moving=0.0) for i, pose in enumerate(poses)]
+    records[1] = replace(records[1], moving=0.25, moving_pixels=to_run_lengths((columns >= 12).reshape(12, 16)))
+    view = random_observation(192)
+    looks = no_looks(view, config.motion)
+    moves = jnp.asarray(columns < 4)
+    looks = replace(
+        looks,
+        depth=jnp.full((3, 2, 192), depth).at[0].set(0.0),
+        moving=looks.moving.at[2].set(moves),
+        time=jnp.asarray([-1, 5, 4], jnp.int32),
+    )
+    estimate = eqx.tree_at(lambda b: b.depth_noise, exact_estimate(), jnp.asarray(0.01))
+    state = SlamState(map, view, jaxlie.SE3.identity(), estimate, jnp.asarray(7), looks)
+    run = run_of(records, state, config)
+    run = replace(run, atlas=replace(run.atlas, camera=camera))
+    after = with_looks_ended(run, 6)  # of the record of the last frame
+    settings = config.existence
+    is_back = columns < 4
+    expected = 0.5 - np.where(is_back, settings.hit + settings.miss, 0.0)
+    np.testing.assert_allclose(after.map.existence, expected, rtol=1e-6)
+    assert [record.moving for record in after.records] == [0.0, 0.5, 0.0, 0.0]
+    mask = from_run_lengths(after.records[1].moving_pixels)
+    np.testing.assert_array_equal(mask, ((columns < 4) | (columns >= 12)).reshape(12, 16))
+    assert after.state.looks is None
+    assert with_looks_ended(after, 6).records == after.records
