@@ -23,7 +23,7 @@ from emgs_jax.mapping.run import MappingRun, with_truth
 from emgs_jax.ops.camera import Camera, nearest_pixel, project
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.report.labelling import LabelledMap
-from emgs_jax.report.moving import with_moving
+from emgs_jax.report.moving import moving_mask, with_moving
 
 _densify = stored(densify)
 
@@ -80,12 +80,14 @@ def dense_map(
             rendered.add(row, depth, view.colors, found)
             # A voxel's colour is the mean of all pixels that see it: those of near and frontal views are most of them.
             image = dataset[row].image
+            stays = ~moving_mask(vars(run.records[row]), image.shape[1::-1])  # else what is behind has its colour
             if config.points == "map":
-                drawn = (view.points, view.normals, image / 255.0)
-                yield PointCloud(*(values[view.valid].astype(np.float64) for values in drawn))
+                drawn, is_drawn = (view.points, view.normals, image / 255.0), view.valid & stays
+                yield PointCloud(*(values[is_drawn].astype(np.float64) for values in drawn))
             else:
                 points = run.records[row].scale * own[row]
                 kept, normals = uncontradicted(points, view, run.camera, float(config.surface_depth))
+                kept &= stays
                 seen = posed(camera_cloud(points, kept, image, evaluation), run.poses[row])
                 normals = np.where(normals[kept].any(-1, keepdims=True), normals[kept], seen.normals)
                 yield PointCloud(seen.points, normals, seen.colors)

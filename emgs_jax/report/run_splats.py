@@ -31,6 +31,7 @@ from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.report.colors import save_png, to_bytes
 from emgs_jax.report.finished_run import POLISH, SPLATS_FILE, FinishedRun
+from emgs_jax.report.moving import moving_mask
 from emgs_jax.report.splats import owners
 from emgs_jax.semantics import classify
 
@@ -68,9 +69,11 @@ def polish(
         view = jax.device_get(_densify(gaussians, to_se3(run.poses[row]), run.camera, densify_config))
         view, frame = eqx.tree_at(lambda v: v.rendering, view, None), dataset[row]
         image = frame.image / np.float32(255)
-        if frame.mask is not None:  # what is left out is as the map has it, and holds no splat
-            image = np.where(frame.mask[..., None], view.colors, image)
-            view = eqx.tree_at(lambda v: v.valid, view, view.valid & ~frame.mask)
+        is_out = moving_mask(run.frames[row], image.shape[1::-1])
+        is_out = is_out if frame.mask is None else is_out | frame.mask
+        if is_out.any():  # what is left out is as the map has it, and holds no splat
+            image = np.where(is_out[..., None], view.colors, image)
+            view = eqx.tree_at(lambda v: v.valid, view, view.valid & ~is_out)
         return image, view
 
     nearest = _nearest(gaussians)

@@ -19,6 +19,7 @@ from tiny_run import compose
 from emgs_jax.config import configure
 from emgs_jax.config.configure import build
 from emgs_jax.data.spool import Spool
+from emgs_jax.io.run_lengths import to_run_lengths
 from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.fit import Rates, Views, fit, is_held_out, place_on_splats
 from emgs_jax.polish.seeds import Seeds
@@ -292,6 +293,32 @@ def test_what_is_held_out_never_enters_the_fit_and_the_files_say_what_came_out(f
     other = polish(run, Edited(images_of(run)[0], settings), settings, densify)
     assert (folder / "splats.ply").read_bytes() == splats
     assert other["polish/before_psnr_db"] < found["polish/before_psnr_db"] - 3, "they are what is compared"
+
+
+def test_what_was_taken_for_moving_enters_no_fit(folder):
+    """Noise there, in the images of fitted frames: the splats are those without it."""
+    from experiments.report import images_of
+
+    lines = [json.loads(line) for line in (folder / "frames.jsonl").read_text().splitlines()]
+    is_moving = np.zeros((48, 64), bool)
+    is_moving[10:30, 12:40] = True
+    for line in lines:
+        line["moving_pixels"] = to_run_lengths(is_moving)
+    (folder / "frames.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    run, settings = read_run(folder), build(config(*SHORT), "polish")
+    densify = build(OmegaConf.create(dict(run.provenance["config"])), "densify")
+    dataset, splats = images_of(run)[0], []
+
+    class Noisy(Edited):
+        def __getitem__(self, row):
+            frame = self._dataset[row]
+            noise = np.random.default_rng(row).integers(0, 255, frame.image.shape).astype(np.uint8)
+            return replace(frame, image=np.where(is_moving[..., None], noise, frame.image))
+
+    for frames in (dataset, Noisy(dataset, settings)):
+        polish(run, frames, settings, densify)
+        splats.append((folder / "splats.ply").read_bytes())
+    assert splats[0] == splats[1]
 
 
 def test_a_run_can_end_with_it_and_says_at_once_that_optax_is_missing(exact_run, tmp_path, monkeypatch, capsys):

@@ -11,6 +11,7 @@ from hand_run import STATUSES, densify_config, hand_run, poses_along, wall
 from scene import evaluation_config
 
 from emgs_jax.data.base import Frame
+from emgs_jax.io.run_lengths import to_run_lengths
 from emgs_jax.ops.camera import unproject
 from emgs_jax.report.dense import center_cloud, dense_map
 from emgs_jax.report.labelling import LabelledMap
@@ -55,6 +56,18 @@ def test_every_frame_that_is_not_lost_adds_what_its_own_pose_sees_of_the_map(den
         seen[status] += count
     assert sum(seen.values()) == len(dense.cloud), "nothing is seen from elsewhere"
     assert seen["lost"] == 0
+
+
+def test_what_moves_gives_its_colour_to_nothing(run, dense):
+    """One frame's left half is a mover's: the wall there has no point, since no other frame sees it."""
+    is_moving = np.indices((16, 24))[1] < 12
+    records = [SimpleNamespace(**vars(record)) for record in run.records]
+    records[1].moving_pixels = to_run_lengths(is_moving)
+    moving = SimpleNamespace(**vars(run) | {"records": records})
+    found = dense_map(moving, Pictures(), densify_config(), evaluation_config(), None, num_pictures=0).cloud
+    here = np.abs(dense.cloud.points[:, 0] - XS[1]) < 1.1
+    still = np.abs(found.points[:, 0] - XS[1]) < 1.1
+    assert (~here).sum() == (~still).sum() and 0.4 * here.sum() < still.sum() < 0.6 * here.sum()
 
 
 def test_the_points_are_the_walls_with_its_normals_and_the_images_colours(dense):
