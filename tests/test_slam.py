@@ -60,6 +60,7 @@ def test_the_first_state_holds_the_last_view_as_it_is_in_the_world(state, window
     valid = np.asarray(state.map.gaussians.valid)
     assert valid.sum() == 3 * 768 // (8 * 3)
     np.testing.assert_allclose(np.asarray(state.map.weight)[valid].sum(), 3 * 768 / 8, rtol=1e-5)  # of λ points
+    assert state.time == FRAME and (np.asarray(state.map.birth)[valid] == FRAME - 1).all()
 
 
 def test_an_exact_prediction_is_tracked_and_its_points_are_fused_or_become_gaussians(state, stepped):
@@ -131,6 +132,94 @@ def test_a_slab_that_two_frames_show_is_gone_within_twenty_and_the_wall_behind_i
         counts.append(int((apart.min(1) > 0.4).sum()))
     assert counts[1] >= 5 and counts[-1] == 0
     assert (apart.min(0) < 0.25).mean() >= 0.99
+
+
+def with_row(map, row, likeness, mean, existence):
+    """The map with a copy of one Gaussian in a free row, elsewhere and as likely to exist."""
+    rows = np.arange(ROOM)
+    assert not map.gaussians.valid[row]
+    rows[row] = likeness
+    more = jax.tree.map(sc.device, sc.rows_of(map, rows))
+    means, beliefs = np.array(more.gaussians.means), np.array(more.existence)
+    means[row], beliefs[row] = mean, existence
+    return eqx.tree_at(lambda m: (m.gaussians.means, m.existence), more, (sc.device(means), sc.device(beliefs)))
+
+
+def test_what_moves_is_as_if_it_had_no_points_but_hides_what_is_seen_through_and_is_the_next_frames(window, camera):
+    """A slab at half the depth after four frames without it, in a prediction whose lengths are half the map's."""
+    config = lenient("slam/motion=default", "slam.motion.num_looks=3")
+    state, _ = init_state(window.views, window.T_world_views, FULL, config)
+    for prediction in small_steps(camera, 4):
+        state, info = step(state, prediction, FULL, config)
+        assert not info.moving.any()
+    *_, clean = small_steps(camera, 5)
+    *_, now = small_steps(camera, 5, slab_frames=(4,))
+    is_slab = np.asarray(now.current.points != clean.current.points).any(1).reshape(camera.height, camera.width)
+    images = lambda p: (p.current.points, p.previous.points)  # noqa: E731
+    now = eqx.tree_at(images, now, tuple(0.5 * points for points in images(now)))
+    middle = np.asarray(clean.current.points)[(camera.height // 2) * camera.width + camera.width // 2]
+    T, held = sc.matrix_of(sc.path_pose(FRAME + 0.8)), np.asarray(state.map.gaussians.valid)
+    # A quarter of the way to the wall, and of the normal of what is there.
+    before = T[:3, :3] @ (0.25 * middle) + T[:3, 3]
+    apart = np.linalg.norm(state.map.gaussians.means - (T[:3, :3] @ middle + T[:3, 3]), axis=1)
+    near, row = np.where(held, apart, np.inf).argmin(), np.flatnonzero(~held)[-1]
+    state = eqx.tree_at(lambda s: s.map, state, with_row(state.map, row, near, before, 0.5))
+
+    new, info = step(state, now, FULL, config)
+    moving = np.asarray(info.moving)
+    assert (
+        moving[is_slab].mean() > 0.6 and not moving[np.abs(np.indices(moving.shape)[0] - camera.height // 2) > 6].any()
+    )
+    moving = moving.ravel()
+    without = eqx.tree_at(lambda p: p.current.valid, now, sc.device(~moving))
+    other, _ = step(state, without, FULL, config)
+    assert info.localization.is_tracked
+    sc.assert_same(new.T_world_previous, other.T_world_previous)
+    sc.assert_same(new.map.gaussians, other.map.gaussians)
+    sc.assert_same(new.map.weight, other.map.weight)
+    assert new.previous.valid.all() and not other.previous.valid[moving].any()
+    change = [float(s.map.existence[row]) - 0.5 for s in (new, other)]
+    np.testing.assert_allclose(change, [-config.existence.miss, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(new.looks.moving[0], moving)
+    depth = np.asarray(new.looks.depth[0]).reshape(2, *is_slab.shape)[:, camera.height // 2, camera.width // 2]
+    np.testing.assert_allclose(depth, 0.5 * middle[2], rtol=0.1)  # of it and its neighbours
+    relative = new.T_world_previous.inverse() @ state.T_world_previous
+    assert max(sc.pose_error(jaxlie.SE3(new.looks.T_previous_look.wxyz_xyz[1]), relative)) < 1e-6
+
+
+def test_a_frame_is_aligned_with_what_is_confirmed_alone(state, settings):
+    """What is confirmed stands 5 cm before the walls, what is not where they are."""
+    map, held = state.map, np.flatnonzero(state.map.gaussians.valid)
+    beside = np.arange(len(held)) + len(held)  # the same again, in free rows
+    rows = np.arange(ROOM)
+    rows[beside] = held
+    both = jax.tree.map(sc.device, sc.rows_of(map, rows))
+    means, beliefs, valid = (np.array(x) for x in (both.gaussians.means, both.existence, both.gaussians.valid))
+    means[held] += 0.05 * np.asarray(map.gaussians.normals)[held]
+    leaves, found = lambda m: (m.gaussians.means, m.existence, m.gaussians.valid), []  # noqa: E731
+    for is_there, belief in ((False, 0.0), (True, 0.0), (True, 1.0)):
+        valid[beside], beliefs[beside] = is_there, belief
+        given = eqx.tree_at(leaves, both, tuple(sc.device(x) for x in (means, beliefs, valid)))
+        _, info = step(eqx.tree_at(lambda s: s.map, state, given), exact(FRAME), FULL, settings)
+        found.append(float(info.localization.depth_noise))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-3)  # roundings
+    assert found[2] < 0.5 * found[0]
+
+
+def test_a_step_works_on_the_map_where_the_frame_before_was_and_where_this_one_is(state, settings):
+    """Each shows another half of the room; where the next camera will be does not matter."""
+    near = sc.at(settings, "submap.margin", 0.1)
+    prediction = exact(FRAME)
+    is_left = np.arange(768) % 32 < 16
+    views = np.array(prediction.T_world_views.wxyz_xyz)
+    views[2, 4:] += 50.0
+    shown = eqx.tree_at(
+        lambda p: (p.current.valid, p.T_world_views), prediction, (sc.device(is_left), jaxlie.SE3(sc.device(views)))
+    )
+    begun = eqx.tree_at(lambda s: s.previous.valid, state, sc.device(~is_left))
+    _, info = step(begun, shown, FULL, near)
+    _, whole = step(begun, shown, FULL, settings)
+    assert whole.em.num_fused > 100 and info.em.num_fused > 0.9 * whole.em.num_fused
 
 
 def test_candidates_come_from_the_points_that_em_left_over(stepped):
