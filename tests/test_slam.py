@@ -277,6 +277,7 @@ def test_a_frame_that_is_not_tracked_leaves_the_map_bit_for_bit(state, settings,
     new, info = step(state, prediction, FULL, config)
     assert not info.localization.is_tracked and info.localization.reason > 0
     assert info.em.num_fused == 0 and info.em.num_points == 0 and info.refinement.num_fresh == 0
+    assert info.num_left_out == 0 and info.origin == state.time, "no point is one that no map can hold"
     sc.assert_same(new.map, state.map)
     # What is not to be mapped may still be what the next frame's coarse pose needs.
     seen = np.asarray(new.previous.valid)
@@ -287,9 +288,9 @@ def test_a_frame_that_is_not_tracked_leaves_the_map_bit_for_bit(state, settings,
 def odd(name: str) -> Prediction:
     """With a number that no prior should say."""
     given = exact(FRAME)
-    if name == "colour":
+    if name in COLOURS:
         colors = np.array(given.current.colors)
-        colors[5] = 1e30
+        colors[5] = COLOURS[name]
         return eqx.tree_at(lambda p: p.current.colors, given, sc.device(colors))
     if name in COVARIANCES:
         return eqx.tree_at(lambda p: p.pose_covariance, given, sc.device(np.stack([COVARIANCES[name]] * 2)))
@@ -297,6 +298,7 @@ def odd(name: str) -> Prediction:
     return eqx.tree_at(lambda p: p.T_world_anchor, given, jaxlie.SE3(sc.device(anchor)))
 
 
+COLOURS = {"colour": 1e30, "no colour": np.nan}  # the first is clipped
 COVARIANCES = {
     "negative variance": np.diag([1.0, 1.0, 1.0, -1e-3, 1e-4, 1e-4]),
     "errors that are one and the same": np.ones((6, 6)),
@@ -306,10 +308,11 @@ COVARIANCES = {
 
 
 @pytest.mark.parametrize("coarse", ["fused", "anchored"])
-@pytest.mark.parametrize("name", ["colour", "no rotation", "anchor beyond any map", *COVARIANCES])
+@pytest.mark.parametrize("name", [*COLOURS, "no rotation", "anchor beyond any map", *COVARIANCES])
 def test_whatever_a_prior_says_the_state_is_sound_and_the_next_frame_tracked(state, settings, name, coarse):
     config = sc.at(settings, "localization.coarse", COARSE.index(coarse))
     state, info = step(state, odd(name), FULL, config)
+    assert info.num_left_out == (name == "no colour")
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((state, info.T_world_camera)))
     np.testing.assert_allclose(np.linalg.norm(state.T_world_previous.rotation().wxyz), 1.0, atol=1e-5)
     _, info = step(state, exact(FRAME + 1), FULL, config)
