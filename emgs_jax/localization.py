@@ -12,6 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.gaussians import GaussianIndex, Gaussians
 from emgs_jax.observation import Observation, Prediction, transform
 from emgs_jax.ops.camera import Camera
+from emgs_jax.ops.constants import MAD_TO_STD
 from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, stack, traced
@@ -36,7 +37,7 @@ from emgs_jax.registration.pose_noise import (
     repeat_poses,
 )
 from emgs_jax.registration.problem import CoarseStart, IcpConfig
-from emgs_jax.registration.repeated_prediction import repeat_error, repeat_scale, through_previous
+from emgs_jax.registration.repeated_prediction import mean_depth_of, repeat_error, repeat_scale, through_previous
 from emgs_jax.registration.rigid import MIN_PAIRS, pose_row, scale_translation
 
 # Bits of LocalizationInfo.reason; the words are for people.
@@ -101,7 +102,7 @@ class CoarsePose(eqx.Module):
         T_world_newest: temporary pose of the newest image (the current one's where there is none).
         scale: by which this prediction is multiplied about its cameras' origins.
         repeat_rms: m; disagreement of the two predictions of the previous image, after alignment.
-        mean_depth: m; of the previous image, scaled.
+        mean_depth: m; of the previous image, or of this one where that shows nothing, scaled.
         depth_noise: as a fraction; the larger of this disagreement and what the previous frame differed from the map.
         estimate: covariance of this pose and scale; the rest of the frame before.
         is_known: False where the prediction has no pose: this one is that of the frame before.
@@ -254,7 +255,9 @@ def localize_coarse(
     """
     now, estimate = prediction.previous, exact_estimate() if estimate is None else estimate
     scale, ratio_std = repeat_scale(now, previous, T_world_previous, jnp.exp(estimate.log_scale), config.coarse_scale)
-    repeat_rms, mean_depth = repeat_error(now, previous, T_world_previous, scale, config.max_pair_distance)
+    mean_depth = scale * mean_depth_of(prediction)
+    unknown = MAD_TO_STD * config.max_pair_distance * mean_depth  # where nothing is repeated
+    repeat_rms = repeat_error(now, previous, T_world_previous, scale, unknown)
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, estimate.depth_noise), LEAST_NOISE)
     # As printed, nothing is known before.
     is_given = is_given_pose(prediction) & (config.icp.prior_information > 0)

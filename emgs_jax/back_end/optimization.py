@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -23,6 +24,7 @@ from emgs_jax.pose_graph.factors import Nodes, PoseGraph
 from emgs_jax.pose_graph.optimize import optimize
 from emgs_jax.pose_graph.problem import bucket
 from emgs_jax.registration.pose_estimate import rescale_estimate
+from emgs_jax.registration.rigid import scale_translation
 from emgs_jax.slam import SlamState
 
 move_map, _move_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)  # a map is compiled for once
@@ -63,13 +65,18 @@ def nodes_of(end: BackEnd, submap_id: int | None = None) -> Nodes:
 
 
 def deform_state(state: SlamState, before: Nodes, after: Nodes, min_std: float, config: DeformConfig) -> SlamState:
-    """Deform the map and the last frame from the poses `before` to those `after`."""
+    """Deform the map and the last frame from the poses `before` to those `after`; earlier looks grow as it does."""
     last = state.time - 1
+    looks, growth = state.looks, jnp.exp(after.log_scale[last] - before.log_scale[last])
+    if looks is not None:
+        poses = jax.vmap(scale_translation, (0, None))(looks.T_previous_look, growth)
+        looks = replace(looks, depth=growth * looks.depth, T_previous_look=poses)
     return replace(
         state,
         map=move_map(state.map, before, after, jnp.asarray(min_std, jnp.float32), config),
         previous=_move_view(state.previous, before, after, last),
         T_world_previous=_moved_pose(state.T_world_previous, before, after, int(last)),
+        looks=looks,
     )
 
 

@@ -29,7 +29,7 @@ class PlaceRecognitionConfig:
         max_depth_step: between the depths of the four pixels around a keypoint, relative to the smallest; where it is
             larger a depth between them would lie on no surface.
         grid: columns and rows of the depths that are kept.
-        max_training: descriptors that it is trained on.
+        max_training: descriptors that it is trained on; no fewer than words.
         min_gap: between the query and a candidate.
         suppressed_gap: around a candidate, in which a less similar one is left out.
         num_neighbours: keyframes before the query, whose similarities to it give the threshold.
@@ -43,7 +43,7 @@ class PlaceRecognitionConfig:
     num_words: int = number(low=1, high=65536)
     max_training: int = number(low=1, high=1e8)
     num_iterations: int = number(low=0, high=1000)
-    seed: int = number(low=0, high=2**31)
+    seed: int = number(low=0, high=2**31 - 1)
     min_gap: int = number(low=0)
     suppressed_gap: int = number(low=0)
     num_candidates: int = number(low=1, high=1000)
@@ -184,7 +184,7 @@ def train_words(
     num_words, max_training, num_iterations = sizes
     if len(descriptors) < num_words:
         return np.zeros((0, descriptors.shape[1]), np.float32)
-    count = min(len(descriptors), max_training)
+    count = min(len(descriptors), max(max_training, num_words))
     chosen = descriptors[np.linspace(0, len(descriptors) - 1, count).astype(int)]
     cv2.setRNGSeed(seed)
     stop = (cv2.TERM_CRITERIA_MAX_ITER, num_iterations, 0.0)
@@ -220,7 +220,7 @@ def propose_candidates(database: Database, row: int, config: PlaceRecognitionCon
     if not len(neighbours):
         return []
     frames = np.array([keyframe.frame for keyframe in database.keyframes[: row + 1]])
-    is_old = frames <= frames[row] - config.min_gap
+    is_old = frames <= frames[row] - max(config.min_gap, 1)
     # An image without keypoints is like none, itself included.
     is_alike = (similarity >= np.quantile(neighbours, config.quantile)) & (similarity > 0)
     return _apart(similarity, frames, is_old & is_alike, config.num_candidates, config.suppressed_gap)

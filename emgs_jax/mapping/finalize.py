@@ -12,7 +12,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from emgs_jax.back_end.state import transform_nodes
+from emgs_jax.back_end.state import BackEnd, transform_nodes
 from emgs_jax.device.arrays import on_device
 from emgs_jax.device.executables import stored
 from emgs_jax.gaussian_map import transform_rows
@@ -66,7 +66,7 @@ def with_first_frame(atlas: Atlas, first: np.ndarray) -> tuple[Atlas, np.ndarray
         The atlas, and what was added of the first frame; None: nothing.
     """
     graph = atlas.graph
-    rows = [row for row, node in enumerate(graph.nodes) if node.covariance is not None]
+    rows = [row for row in _active_rows(graph) if graph.nodes[row].covariance is not None]
     if atlas.state is None or graph.first_node or not rows:
         return atlas, None
     own = own_covariance(atlas.state, atlas.config.localization)
@@ -76,6 +76,11 @@ def with_first_frame(atlas: Atlas, first: np.ndarray) -> tuple[Atlas, np.ndarray
     for row, added in zip(rows, seen_from(own, first, np.stack([nodes[row].pose for row in rows])), strict=True):
         nodes[row] = replace(nodes[row], covariance=nodes[row].covariance + added)
     return replace(atlas, graph=replace(graph, nodes=tuple(nodes))), own
+
+
+def _active_rows(graph: BackEnd) -> list[int]:
+    """Nodes of the active submap; the others are in worlds and units of their own."""
+    return [row for row, node in enumerate(graph.nodes) if node.submap == graph.active]
 
 
 def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
@@ -97,13 +102,14 @@ def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
 def rescale_atlas(atlas: Atlas, first: np.ndarray) -> Atlas:
     """Apply `in_prior_unit` to a run that ends, its pose graph included, about the `first` camera's pose (4, 4).
 
-    A saved map keeps its unit, and so does one of joined submaps: the mean is of the last one's inferences.
+    A saved map keeps its unit, and so does one of joined submaps: the mean is of the last one's inferences. Submaps
+    that were never joined stay, poses and maps, in the worlds that they have.
     """
     graph, state = atlas.graph, atlas.state
     if state is None or graph.first_node or not graph.has_one_unit or not state.estimate.log_scale:
         return atlas
     similarity = Sim3.about(first[:3, 3], np.exp(-float(state.estimate.log_scale)))
-    graph = transform_nodes(graph, range(len(graph.nodes)), similarity)
+    graph = transform_nodes(graph, _active_rows(graph), similarity)
     return with_state(replace(atlas, graph=graph), in_prior_unit(state, first[:3, 3]), atlas.config)
 
 

@@ -18,7 +18,7 @@ from emgs_jax.pose_graph.sparse import damped_step
 
 # χ² of a measured row that nothing is to be gained from: errors of a thousandth of their standard deviation.
 NOTHING_TO_GAIN = 1e-6
-MAX_DAMPING = 1e8
+LEAST_DAMPING, MAX_DAMPING = 1e-6, 1e8
 
 
 class PoseGraphConfig(eqx.Module):
@@ -30,7 +30,7 @@ class PoseGraphConfig(eqx.Module):
         start: `current` poses, or `chordal` (errors spread over the paths, where that costs less; and, where a loop
             would be rejected, the solution with all loops at full weight).
         max_iterations: of Levenberg and Marquardt; 0: nothing moves.
-        damping: λ at the start, times the Hessian's diagonal.
+        damping: λ at the start, times the Hessian's diagonal; from 0 on it is Gauss and Newton's until a step fails.
         min_decrease: relative, of the cost; less has converged.
         max_misfit: χ² per measured row of all but loops: a result that bends these more than that, and than they were,
             is refused.
@@ -88,7 +88,7 @@ def _minimize(problem: Problem, now: Linear, config: PoseGraphConfig) -> tuple[L
                 return now, iteration + 1, True
             if gain > 0:
                 continue
-        damping *= 10.0
+        damping = 10.0 * damping or LEAST_DAMPING
         if damping > MAX_DAMPING:
             return now, iteration + 1, False
     return now, config.max_iterations, False

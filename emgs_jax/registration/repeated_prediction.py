@@ -7,7 +7,6 @@ from jaxtyping import Array, Bool, Float
 
 from emgs_jax.observation import Observation, Prediction, depth_in, sound, transform
 from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
-from emgs_jax.ops.constants import MAD_TO_STD
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import stack
 from emgs_jax.registration.noise import num_independent, robust_std
@@ -53,25 +52,29 @@ def repeat_scale(
     return scale, jnp.sqrt(0.5 * jnp.pi / count) * scatter
 
 
+def mean_depth_of(prediction: Prediction) -> Float[Array, ""]:
+    """Median depth of the previous image, in the prediction's unit; of the current one where that shows nothing."""
+    views = prediction.previous, prediction.current
+    depths = [view.points[:, 2] for view in views]
+    known = [view.valid & (depth > NEAREST_DEPTH) for view, depth in zip(views, depths, strict=True)]
+    is_shown = jnp.any(known[0])
+    return median(jnp.where(is_shown, depths[0], depths[1]), jnp.where(is_shown, known[0], known[1]))
+
+
 @full_precision
 def repeat_error(
     now: Observation,
     before: Observation,
     T_world_previous: jaxlie.SE3,
     scale: Float[Array, ""],
-    max_pair_distance: Float[Array, ""],
-) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Return the robust standard deviation between two predictions of one image, and the median of its depth, m.
-
-    Without a pair nothing is known, and `max_pair_distance` (fraction of the depth) stands in.
-    """
-    paired, depth = now.valid & before.valid, now.points[:, 2]
-    mean_depth = scale * median(depth, now.valid & (depth > NEAREST_DEPTH))
+    otherwise: Float[Array, ""],
+) -> Float[Array, ""]:
+    """Return the robust standard deviation, m, between two predictions of one image; `otherwise` without a pair."""
+    paired = now.valid & before.valid
     apart = transform(T_world_previous, now, scale).points - before.points
     differs = jnp.any(apart != 0, axis=-1)  # a length has no gradient where it is 0
     apart = jnp.where(differs, jnp.linalg.norm(jnp.where(differs[:, None], apart, 1.0), axis=-1), 0.0)
-    apart = jnp.where(jnp.any(paired), robust_std(apart, paired), MAD_TO_STD * max_pair_distance * mean_depth)
-    return apart, mean_depth
+    return jnp.where(jnp.any(paired), robust_std(apart, paired), otherwise)
 
 
 @full_precision

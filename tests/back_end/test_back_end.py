@@ -9,7 +9,7 @@ import jaxlie
 import numpy as np
 import pytest
 from omegaconf import OmegaConf
-from scene import assert_same, random_gaussians, random_observation
+from scene import assert_same, device, random_gaussians, random_observation
 
 from emgs_jax import back_end, load_config
 from emgs_jax.back_end.factors import FrameData, map_factor, sequential_factor, stack_factors
@@ -22,10 +22,17 @@ from emgs_jax.back_end.loops import (
     remove_inconsistent,
     violated,
 )
-from emgs_jax.back_end.optimization import close_loops, depth_noise_of, merge_duplicates_of_state, nodes_of
-from emgs_jax.back_end.state import BackEnd, Node, add_node
+from emgs_jax.back_end.optimization import (
+    close_loops,
+    deform_state,
+    depth_noise_of,
+    merge_duplicates_of_state,
+    nodes_of,
+)
+from emgs_jax.back_end.state import BackEnd, Node, add_node, transform_nodes
+from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import new_map
-from emgs_jax.geometry import scale_pose
+from emgs_jax.geometry import Sim3, scale_pose
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe
 from emgs_jax.loop_closure.prior_query import JointPrediction
 from emgs_jax.loop_closure.verification import LoopMeasurement
@@ -34,6 +41,7 @@ from emgs_jax.mapping.atlas import Atlas, Submap, World
 from emgs_jax.mapping.event import Event
 from emgs_jax.mapping.integrate import finish_back_end, update_graph
 from emgs_jax.mapping.window_input import WindowInput
+from emgs_jax.motion import Looks
 from emgs_jax.pose_graph.deform import DeformConfig
 from emgs_jax.pose_graph.factors import PoseGraph, residuals
 from emgs_jax.registration.pose_estimate import exact_estimate
@@ -143,6 +151,22 @@ def test_the_mean_of_the_scales_that_the_unit_of_a_run_is_made_of_follows_a_clos
     end = atlas.graph
     assert end.accepted and log_scale - np.mean(end.log_scales) > 1e-3  # `scale_std` asks for scales of one
     assert float(atlas.state.estimate.log_scale) == pytest.approx(np.mean(end.log_scales), abs=1e-5)
+
+
+def test_what_earlier_frames_looked_through_grows_with_the_map(graph):
+    """Oracle: points of a look, about the last camera. Else a map that shrinks stands in its own free space."""
+    poses, factor = ring(), 0.8
+    end = walked(graph, poses)
+    before = nodes_of(end)
+    after = nodes_of(transform_nodes(end, range(COUNT), Sim3.about(poses[0][:3, 3], factor)))
+    depth, motions = np.linspace(1, 3, 80).reshape(2, 2, 20), np.linalg.inv(poses[-1]) @ poses[-3:-1]
+    looks = Looks(device(depth), jnp.zeros((2, 20), bool), to_se3(motions))
+    state = replace(state_of(poses), looks=looks)
+    found = deform_state(state, before, after, 0.01, graph.deform).looks
+    np.testing.assert_allclose(found.depth, factor * depth, rtol=1e-6)
+    expected = np.stack([scale_pose(motion, factor) for motion in motions])
+    np.testing.assert_allclose(found.T_previous_look.as_matrix(), expected, atol=1e-6)
+    assert_same(deform_state(state, before, before, 0.01, graph.deform).looks, looks)
 
 
 def test_loops_that_are_contradicted_later_are_no_edges_any_more(graph):

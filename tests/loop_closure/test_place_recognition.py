@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from loop_scene import INTRINSICS, SIZE, looks, place_recognition_config
 
+from emgs_jax import load_config
 from emgs_jax.keypoints.sift import detect
 from emgs_jax.loop_closure.place_recognition import (
     Database,
@@ -159,6 +160,21 @@ def test_the_threshold_is_that_quantile_of_the_similarity_to_the_last_neighbours
     assert propose_candidates(database, 4, dataclasses.replace(config, quantile=0.6)) == []
     assert len(propose_candidates(database, 4, dataclasses.replace(config, quantile=0.0))) == 2
     assert propose_candidates(database, 0, config) == []
+
+
+def test_without_a_gap_an_image_is_no_candidate_for_itself():
+    """It was the best one, and hid all that are near it."""
+    config = place_recognition_config("num_neighbours=2", "quantile=0.0", "min_gap=0", "suppressed_gap=25")
+    assert propose_candidates(alike((0, 100, 197, 198, 200), (0.7, 0.6, 0.5, 0.9, 1.0)), 4, config) == [3, 0, 1]
+
+
+def test_words_are_trained_on_no_fewer_descriptors_than_words():
+    """OpenCV refused to find more centres than it had descriptors, in the middle of a run."""
+    sample = unit_descriptors(described())
+    np.testing.assert_array_equal(train_words(sample, (16, 1, 5), 0), train_words(sample, (16, 16, 5), 0))
+    assert train_words(sample, (16, 16, 5), 2**31 - 1).shape == (16, sample.shape[1])
+    with pytest.raises(ValueError, match=r"seed"):
+        load_config("graph=default", f"graph.place_recognition.seed={2**31}")
 
 
 def test_a_blank_image_has_a_keyframe_and_is_no_candidate():

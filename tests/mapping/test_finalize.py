@@ -92,6 +92,13 @@ def test_the_file_of_the_frames_says_it_too(tmp_path):
         assert np.max(line["covariance"]) > 2e-4
 
 
+def test_frames_of_a_submap_that_was_never_joined_are_not_relative_to_the_first_frame():
+    atlas = a_run().atlas
+    nodes = [*atlas.graph.nodes[:2], *(replace(node, submap=1) for node in atlas.graph.nodes[2:])]
+    found, own = with_first_frame(replace(atlas, graph=replace(atlas.graph, nodes=tuple(nodes))), np.eye(4))
+    assert own.any() and found.graph.nodes[1] is not nodes[1] and found.graph.nodes[2] is nodes[2]
+
+
 def test_poses_in_a_saved_map_are_not_relative_to_a_first_frame():
     atlas = a_run().atlas
     atlas = replace(atlas, graph=replace(atlas.graph, first_node=1))

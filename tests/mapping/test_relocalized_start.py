@@ -30,6 +30,7 @@ from emgs_jax.mapping.tracking import (
     rejection,
     relocalized_start,
 )
+from emgs_jax.motion import Looks
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.pose_estimate import exact_estimate
@@ -97,6 +98,18 @@ def test_map_unit_and_time_of_a_lost_run_go_on():
     assert int(state.time) == 12 and float(state.estimate.num_scales) == 9
     np.testing.assert_array_equal(state.estimate.log_scale, before.estimate.log_scale)
     np.testing.assert_allclose(state.estimate.covariance, FOUND_THERE.covariance)
+
+
+def test_earlier_looks_stay_where_they_are_in_the_world():
+    """They went with the camera to where it was found, and what stands there was taken for moving."""
+    poses = to_se3(np.stack([matrix((0, 10 * k, 0), (0.2 * k, 0, 0)) for k in range(3)]))
+    last = matrix((0, 20, 0), (1.0, 0, 2.0))
+    looks = Looks(jnp.ones((3, 2, 20)), jnp.zeros((3, 20), bool), poses)
+    before = replace(lost_state(), T_world_previous=to_se3(last), looks=looks)
+    state, _ = relocalized_start(before, prediction(), FOUND_THERE)
+    there, expected = (np.asarray(x.as_matrix(), float) for x in (state.looks.T_previous_look, poses))
+    np.testing.assert_allclose(PLACE @ there, last @ expected, atol=1e-5)
+    np.testing.assert_array_equal(state.looks.depth, looks.depth)
 
 
 def test_in_a_saved_map_the_unit_is_what_the_first_frame_found_says():

@@ -1,5 +1,7 @@
 """The unit of a finished run: all lengths times one factor about the first camera, and what follows from them."""
 
+from dataclasses import replace
+
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
@@ -9,6 +11,7 @@ from hand_run import run_of
 from scene import assert_same, pose, random_gaussians, random_observation
 
 from emgs_jax.gaussian_map import new_map
+from emgs_jax.mapping.atlas import Submap
 from emgs_jax.mapping.finalize import rescale_atlas
 from emgs_jax.mapping.pipeline import with_atlas
 from emgs_jax.mapping.records import FrameRecord
@@ -63,6 +66,18 @@ def test_all_lengths_grow_about_the_first_camera_and_directions_stay():
     np.testing.assert_allclose(
         after.estimate.repeats.predicted.translation(), factor * np.tile(SAID, (2, 1)), rtol=1e-5
     )
+
+
+def test_a_submap_that_was_never_joined_stays_with_its_poses():
+    """Poses of its frames were rescaled about a camera of another world, and its map was not."""
+    run = a_run(LOG_SCALE)
+    atlas, here, there = run.atlas, *run.atlas.graph.nodes[:2]
+    nodes = (here, replace(there, submap=1), *run.atlas.graph.nodes[2:])
+    other = Submap(a_run(0.0).state)
+    atlas = replace(atlas, graph=replace(atlas.graph, nodes=nodes), submaps={**atlas.submaps, 1: other})
+    found = rescale_atlas(atlas, here.pose)
+    assert found.graph.nodes[1] is nodes[1] and found.submaps[1] is other
+    assert found.graph.nodes[2].log_scale == pytest.approx(nodes[2].log_scale - LOG_SCALE)
 
 
 def test_a_map_in_the_priors_own_unit_keeps_every_bit():

@@ -337,6 +337,16 @@ def test_of_both_searches_the_cheaper_one_is_taken():
     assert costs[1] <= costs[0] * (1 + 1e-9)
 
 
+def test_without_damping_at_the_start_a_step_that_fails_is_damped():
+    """0 stayed 0: the same step was tried until none was left. Oracle: the optimum as found from near the truth."""
+    rng, truth = np.random.default_rng(0), walk(20, laps=1.0, scale_std=0.1)
+    edges = join(measure(truth, window_pairs(20, (1, 2)), STD, rng), measure_loops(truth, [(0, 19), (1, 18)], STD, rng))
+    free = {"start": "current", "kernel": np.inf, "max_iterations": 200, "scale_std": np.inf}
+    far = disturb(truth, np.random.default_rng(1), np.array([3.0] * 3 + [1.5] * 3 + [1.0]))
+    (_, best), (_, info) = (optimize(PoseGraph(given, edges), config(damping=0.0, **free)) for given in (truth, far))
+    assert info.converged and not info.reason and info.cost == pytest.approx(best.cost, rel=1e-6)
+
+
 def test_a_step_that_costs_more_is_not_taken():
     """From far away, undamped: more steps never cost more, and some of them are refused."""
     truth = walk(30, laps=1.0)

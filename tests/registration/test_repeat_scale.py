@@ -5,11 +5,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scene import device, moved_points, observe_room, on_host, path_pose, pose, replace
+from scene import device, moved_points, observe_room, on_host, path_pose, pose, predict_room, replace
 
 from emgs_jax.observation import transform
 from emgs_jax.ops.camera import Camera
-from emgs_jax.registration.repeated_prediction import repeat_error, repeat_scale
+from emgs_jax.registration.repeated_prediction import mean_depth_of, repeat_error, repeat_scale
 
 CAMERA = Camera([30.0, 33.0], [19.5, 15.25], 40, 32)
 T, NOW = path_pose(2), observe_room(path_pose(2), CAMERA)
@@ -85,7 +85,7 @@ def test_what_two_equal_predictions_differ_by_has_finite_slopes():
 
     def total(points):
         same = eqx.tree_at(lambda o: o.points, before, points)
-        return sum(repeat_error(before, same, pose(), jnp.ones(()), jnp.ones(())))
+        return repeat_error(before, same, pose(), jnp.ones(()), jnp.ones(()))
 
     assert np.isfinite(on_host(jax.grad(total))(before.points)).all()
 
@@ -95,7 +95,14 @@ def test_what_two_equal_predictions_differ_by_has_finite_slopes():
 )
 def test_the_mean_depth_is_the_median_of_the_points_before_the_camera(factor, expected):
     """Where all points were at the camera, depths were a part of 0 and the whole state NaN."""
-    depths = factor * np.asarray(NOW.points)
-    now, before = replace(NOW, points=depths), moved_points(T, NOW)
-    _, depth = on_host(repeat_error)(now, before, T, device(1.0), device(1.0))
-    assert depth == pytest.approx(expected)
+    now = replace(NOW, points=factor * np.asarray(NOW.points))
+    found = eqx.tree_at(lambda p: (p.previous, p.current), predict_room(2, CAMERA), (now, now))
+    assert on_host(mean_depth_of)(found) == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1.0, 1e3])
+def test_where_the_previous_image_shows_nothing_the_mean_depth_is_that_of_this_one(unit):
+    """It was 1, whatever the unit: gates and deviations after a black frame were those of a room of a metre."""
+    found = eqx.tree_at(lambda p: p.previous.valid, predict_room(2, CAMERA, scale=unit), np.zeros(NUM_PIXELS, bool))
+    depths = np.sort(np.asarray(NOW.points)[:, 2])
+    assert on_host(mean_depth_of)(found) == pytest.approx(unit * depths[(NUM_PIXELS - 1) // 2])
