@@ -170,12 +170,15 @@ def test_neighbours_that_are_not_verified_or_put_the_query_elsewhere_are_refused
 
 
 def drifted_path(log_scale=0.0):
-    """Poses of a lap that ends 1 m and 20° off, and of 4 frames that come back; and the loops that say so."""
+    """Poses of a lap that ends 1 m and 20° off, and of 4 frames that come back; and the loops that say so.
+
+    `log_scale` is of the first visit, whose unit theirs is.
+    """
     drift = matrix((0, 20, 0), (1.0, 0, 0.2))
     truth = {frame: matrix((0, 0.5 * frame, 0), (0.1 * frame, 0, 0)) for frame in range(12)}
     truth |= {500 + frame: matrix((0, 0.5 * frame + 1, 0), (0.1 * frame, 0.05, 0)) for frame in range(12)}
     now = {frame: drift @ T if frame >= 500 else T for frame, T in truth.items()}
-    scales = dict.fromkeys(truth, log_scale)
+    scales = {frame: log_scale if frame < 500 else 0.7 for frame in truth}
 
     def loop(a, b, wrong=None):
         Z = scale_pose(np.linalg.inv(truth[a]) @ truth[b], np.exp(-log_scale))
@@ -204,6 +207,18 @@ def test_loops_of_one_query_are_one_witness_and_distant_ones_none():
     far = [loop(0, 500), loop(1, 501), loop(2, 511)]
     assert not spatially_consistent(far, [], poses, scales, config).any()
     assert spatially_consistent([*far[:2], loop(2, 502)], [], poses, scales, config).all()
+
+
+def test_each_of_two_loops_must_fit_the_query_of_the_other():
+    """The second is turned by 3 degrees about the query of the first, and its own is 4 m from there: 21 cm."""
+    poses = {frame: matrix((0, 0, 0), (4.0 * (frame % 2), 0, 0)) for frame in (0, 1, 500, 501)}
+    scales, config = dict.fromkeys(poses, 0.0), loops_config("consistency.min_others=1")["consistency"]
+    first = LoopMeasurement(0, 500, np.eye(4), 0.0, np.eye(7), 100)
+    for turn, is_consistent in ((0.0, True), (3.0, False)):
+        Z = np.linalg.inv(poses[1]) @ matrix((0, turn, 0)) @ poses[501]
+        second = LoopMeasurement(1, 501, Z, 0.0, np.eye(7), 100)
+        found = spatially_consistent([first, second], [], poses, scales, config)
+        np.testing.assert_array_equal(found, [is_consistent] * 2)
 
 
 def test_pairs_of_nearby_queries_are_all_that_is_compared():
