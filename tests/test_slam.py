@@ -245,7 +245,7 @@ def test_a_step_is_the_same_elsewhere_and_in_other_rows(state, settings):
     off = np.float32([48.0, -32.0, 16.0])
     shift = lambda T: jaxlie.SE3(sc.device(np.asarray(T.wxyz_xyz) + np.append(np.zeros(4, np.float32), off)))  # noqa: E731
     placed = lambda s: (s.map.gaussians.means, s.previous.points, s.T_world_previous)  # noqa: E731
-    layers = eqx.tree_at(lambda s: s.map, state, doubled(state.map, 0.3))  # which stay two
+    layers = eqx.tree_at(lambda s: s.map, state, doubled(state.map, 0.12))  # too far apart to be one
     means, points, T = placed(layers)
     far = eqx.tree_at(placed, layers, (means + off, points + off, shift(T)))
     poses = lambda p: (p.T_world_views, p.T_world_anchor)  # noqa: E731
