@@ -273,8 +273,7 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         prediction, state.previous, state.T_world_previous, state.estimate, view, config.localization
     )
     submap = _select(state.map, state.previous, guess, config.submap)
-    noise = state.estimate.depth_noise
-    moving = _find_movers(state.looks, current, state.T_world_previous, coarse, noise, view, config.motion)
+    moving = _find_movers(state.looks, current, state.T_world_previous, coarse, view, config.motion)
     frame = _localize_fine(current, moving, submap, coarse, state.time, config.localization)
     fused = _fuse(submap, frame, view, num_rows, config.fusion)
     candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
@@ -335,17 +334,15 @@ def _find_movers(
     current: Observation,
     T_world_previous: jaxlie.SE3,
     coarse: CoarsePose,
-    depth_noise: Float[Array, ""],
     view: Camera,
     config: MotionConfig,
 ) -> Bool[Array, "p"]:
-    """What moves in a frame at its coarse pose; `depth_noise` is that of the frame before."""
+    """What moves in a frame at its coarse pose."""
     if looks is None:
         return jnp.zeros(current.valid.shape, bool)
     points = transform(jaxlie.SE3.identity(), current, coarse.scale)
-    estimate = replace(coarse.estimate, depth_noise=depth_noise)
     T_previous_camera = T_world_previous.inverse() @ coarse.T_world_camera
-    return find_movers(looks, points, T_previous_camera, estimate, view, config)
+    return find_movers(looks, points, T_previous_camera, coarse.estimate, view, config)
 
 
 @executable

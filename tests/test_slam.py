@@ -60,6 +60,7 @@ def test_the_first_state_holds_the_last_view_as_it_is_in_the_world(state, window
     valid = np.asarray(state.map.gaussians.valid)
     assert valid.sum() == 3 * 768 // (8 * 3)
     np.testing.assert_allclose(np.asarray(state.map.weight)[valid].sum(), 3 * 768 / 8, rtol=1e-5)  # of λ points
+    assert state.time == FRAME and (np.asarray(state.map.birth)[valid] == FRAME - 1).all()
 
 
 def test_an_exact_prediction_is_tracked_and_its_points_are_fused_or_become_gaussians(state, stepped):
@@ -83,17 +84,20 @@ def test_the_frame_is_kept_as_it_was_aligned_for_the_next_step(stepped):
     np.testing.assert_allclose(new.previous.normals, expected.normals, atol=1e-5)
 
 
-def test_two_layers_that_a_look_cannot_tell_apart_become_one(state, settings):
-    map = state.map
-    held = np.flatnonzero(map.gaussians.valid)
-    beside = np.arange(len(held)) + len(held)  # the same again a millimetre in front, in free rows
-    rows = np.arange(ROOM)
+def doubled(map, distance):
+    """The map with a second layer before it, in free rows."""
+    held, rows = np.flatnonzero(map.gaussians.valid), np.arange(ROOM)
+    beside = np.arange(len(held)) + len(held)
     rows[beside] = held
-    doubled = jax.tree.map(sc.device, sc.rows_of(map, rows))
-    means = np.array(doubled.gaussians.means)
-    means[beside] += 1e-3 * np.asarray(map.gaussians.normals)[held]
-    doubled = eqx.tree_at(lambda m: m.gaussians.means, doubled, sc.device(means))
-    new, info = step(eqx.tree_at(lambda s: s.map, state, doubled), exact(FRAME), FULL, settings)
+    both = jax.tree.map(sc.device, sc.rows_of(map, rows))
+    means = np.array(both.gaussians.means)
+    means[beside] += distance * np.asarray(map.gaussians.normals)[held]
+    return eqx.tree_at(lambda m: m.gaussians.means, both, sc.device(means))
+
+
+def test_two_layers_that_a_look_cannot_tell_apart_become_one(state, settings):
+    held = np.flatnonzero(state.map.gaussians.valid)
+    new, info = step(eqx.tree_at(lambda s: s.map, state, doubled(state.map, 1e-3)), exact(FRAME), FULL, settings)
     assert info.localization.is_tracked
     found = int(info.num_gaussians)
     assert found < 0.85 * 2 * len(held) < 2 * len(held) + info.refinement.num_fresh  # the others are out of sight
@@ -131,6 +135,134 @@ def test_a_slab_that_two_frames_show_is_gone_within_twenty_and_the_wall_behind_i
         counts.append(int((apart.min(1) > 0.4).sum()))
     assert counts[1] >= 5 and counts[-1] == 0
     assert (apart.min(0) < 0.25).mean() >= 0.99
+
+
+def with_one_in_the_way(map, row, T, seen, existence):
+    """The map with one more Gaussian in a free row, a quarter of the way to what the middle of a view shows."""
+    matrix, middle = sc.matrix_of(T), np.asarray(seen.points)[12 * 32 + 16]
+    there = matrix[:3, :3] @ middle + matrix[:3, 3]
+    held, rows = np.asarray(map.gaussians.valid), np.arange(ROOM)
+    assert not held[row]
+    apart = np.linalg.norm(map.gaussians.means - there, axis=1)
+    rows[row] = np.where(held, apart, np.inf).argmin()  # of the normal of what is behind it
+    more = jax.tree.map(sc.device, sc.rows_of(map, rows))
+    means, beliefs = np.array(more.gaussians.means), np.array(more.existence)
+    means[row], beliefs[row] = matrix[:3, 3] + 0.25 * (there - matrix[:3, 3]), existence
+    return eqx.tree_at(lambda m: (m.gaussians.means, m.existence), more, (sc.device(means), sc.device(beliefs)))
+
+
+def test_a_new_gaussian_may_take_the_row_of_one_that_the_same_frame_refutes(state, settings):
+    held = int(np.sum(state.map.gaussians.valid))
+    doubtful = float(settings.existence.refuted) + 0.1
+    map = with_one_in_the_way(state.map, held, sc.path_pose(FRAME), exact(FRAME).current, doubtful)
+    new, info = step(eqx.tree_at(lambda s: s.map, state, map), exact(FRAME), FULL, settings)
+    assert info.num_gaussians == held + info.refinement.num_fresh > held
+    assert new.map.gaussians.valid[held] and new.map.birth[held] == state.time
+
+
+def test_both_halves_of_what_is_split_are_in_the_map(state, settings):
+    """Where every Gaussian with a point is too coarse."""
+    config = sc.changed(settings, **{f"splitting.{name}": 0.0 for name in ("color_std", "num_std", "min_points")})
+    _, info = step(state, exact(FRAME), FULL, config)
+    held = int(np.sum(state.map.gaussians.valid))
+    assert info.num_gaussians - held - info.refinement.num_fresh > 0.3 * held
+
+
+def test_what_moves_is_as_if_it_had_no_points_but_hides_what_is_seen_through_and_is_the_next_frames(window, camera):
+    """A slab at half the depth after four frames without it, in a prediction whose lengths are half the map's."""
+    config = lenient("slam/motion=default", "slam.motion.num_looks=3")
+    state, _ = init_state(window.views, window.T_world_views, FULL, config)
+    for prediction in small_steps(camera, 4):
+        state, info = step(state, prediction, FULL, config)
+        assert not info.moving.any()
+    *_, clean = small_steps(camera, 5)
+    *_, now = small_steps(camera, 5, slab_frames=(4,))
+    is_slab = np.asarray(now.current.points != clean.current.points).any(1).reshape(camera.height, camera.width)
+    images = lambda p: (p.current.points, p.previous.points)  # noqa: E731
+    now = eqx.tree_at(images, now, tuple(0.5 * points for points in images(now)))
+    row = ROOM - 1
+    map = with_one_in_the_way(state.map, row, sc.path_pose(FRAME + 0.8), clean.current, 0.5)
+    state = eqx.tree_at(lambda s: s.map, state, map)
+
+    new, info = step(state, now, FULL, config)
+    moving = np.asarray(info.moving)
+    assert (
+        moving[is_slab].mean() > 0.6 and not moving[np.abs(np.indices(moving.shape)[0] - camera.height // 2) > 6].any()
+    )
+    moving = moving.ravel()
+    without = eqx.tree_at(lambda p: p.current.valid, now, sc.device(~moving))
+    other, _ = step(state, without, FULL, config)
+    assert info.localization.is_tracked
+    sc.assert_same(new.T_world_previous, other.T_world_previous)
+    sc.assert_same(new.map.gaussians, other.map.gaussians)
+    sc.assert_same(new.map.weight, other.map.weight)
+    assert new.previous.valid.all() and not other.previous.valid[moving].any()
+    change = [float(s.map.existence[row]) - 0.5 for s in (new, other)]
+    np.testing.assert_allclose(change, [-config.existence.miss, 0.0], atol=1e-6)
+    np.testing.assert_array_equal(new.looks.moving[0], moving)
+    depth = np.asarray(new.looks.depth[0]).reshape(2, *is_slab.shape)[:, camera.height // 2, camera.width // 2]
+    slab = np.asarray(now.current.points)[is_slab.ravel(), 2] * float(info.localization.scale)
+    assert (depth > 0.99 * slab.min()).all() and (depth < 1.01 * slab.max()).all()
+    relative = new.T_world_previous.inverse() @ state.T_world_previous
+    assert max(sc.pose_error(jaxlie.SE3(new.looks.T_previous_look.wxyz_xyz[1]), relative)) < 1e-6
+
+
+def test_a_frame_is_aligned_with_what_is_confirmed_alone(state, settings):
+    """What is confirmed stands 5 cm before the walls, what is not where they are."""
+    held = np.flatnonzero(state.map.gaussians.valid)
+    beside, both = np.arange(len(held)) + len(held), doubled(state.map, 0.0)
+    means, beliefs, valid = (np.array(x) for x in (both.gaussians.means, both.existence, both.gaussians.valid))
+    means[held] += 0.05 * np.asarray(both.gaussians.normals)[held]
+    leaves, found = lambda m: (m.gaussians.means, m.existence, m.gaussians.valid), []  # noqa: E731
+    for is_there, belief in ((False, 0.0), (True, 0.0), (True, 1.0)):
+        valid[beside], beliefs[beside] = is_there, belief
+        given = eqx.tree_at(leaves, both, tuple(sc.device(x) for x in (means, beliefs, valid)))
+        _, info = step(eqx.tree_at(lambda s: s.map, state, given), exact(FRAME), FULL, settings)
+        found.append(float(info.localization.depth_noise))
+    np.testing.assert_allclose(found[1], found[0], rtol=1e-3)  # roundings
+    assert found[2] < 0.5 * found[0]
+
+
+def test_a_step_works_on_the_map_where_the_frame_before_was_and_where_this_one_is(state, settings):
+    """Each shows another half of the room; where the next camera will be does not matter."""
+    near = sc.at(settings, "submap.margin", 0.1)
+    prediction = exact(FRAME)
+    is_left = np.arange(768) % 32 < 16
+    views = np.array(prediction.T_world_views.wxyz_xyz)
+    views[2, 4:] += 50.0
+    shown = eqx.tree_at(
+        lambda p: (p.current.valid, p.T_world_views), prediction, (sc.device(is_left), jaxlie.SE3(sc.device(views)))
+    )
+    begun = eqx.tree_at(lambda s: s.previous.valid, state, sc.device(~is_left))
+    _, info = step(begun, shown, FULL, near)
+    _, whole = step(begun, shown, FULL, settings)
+    assert whole.em.num_fused > 100 and info.em.num_fused > 0.9 * whole.em.num_fused
+
+
+def test_a_step_is_the_same_elsewhere_and_in_other_rows(state, settings):
+    """60 m off, as far as the gates do not hang on roundings; and with the map's rows from the last to the first."""
+    prediction = noisy_prediction(FRAME, sc.THINNED, np.random.default_rng(0))
+    off = np.float32([48.0, -32.0, 16.0])
+    shift = lambda T: jaxlie.SE3(sc.device(np.asarray(T.wxyz_xyz) + np.append(np.zeros(4, np.float32), off)))  # noqa: E731
+    placed = lambda s: (s.map.gaussians.means, s.previous.points, s.T_world_previous)  # noqa: E731
+    layers = eqx.tree_at(lambda s: s.map, state, doubled(state.map, 0.12))  # too far apart to be one
+    means, points, T = placed(layers)
+    far = eqx.tree_at(placed, layers, (means + off, points + off, shift(T)))
+    poses = lambda p: (p.T_world_views, p.T_world_anchor)  # noqa: E731
+    seen = eqx.tree_at(poses, prediction, tuple(map(shift, poses(prediction))))
+    reverse = eqx.tree_at(lambda s: s.map, state, jax.tree.map(sc.device, sc.rows_of(state.map, slice(None, None, -1))))
+    begun = (layers, prediction), (far, seen), (state, prediction), (reverse, prediction)
+    (_, info), (_, of_far), (here, plain), (reversed_, _) = (step(*given, FULL, settings) for given in begun)
+    assert plain.localization.is_tracked and info.localization.is_tracked and info.em.num_fused > 300
+    assert max(sc.pose_error(shift(info.T_world_camera), of_far.T_world_camera)) < 1e-3
+    assert abs(int(of_far.em.num_fused) - int(info.em.num_fused)) <= 8, "of 768 points"
+    assert abs(int(of_far.num_gaussians) - int(info.num_gaussians)) <= 2
+    held = np.asarray(state.map.gaussians.valid)
+    one, other = (
+        sc.rows_of(map, rows) for map, rows in ((here.map, held), (reversed_.map, np.flatnonzero(held[::-1])[::-1]))
+    )
+    np.testing.assert_array_equal(other.gaussians.valid, one.gaussians.valid)
+    np.testing.assert_allclose(other.weight, one.weight, rtol=1e-3)
 
 
 def test_candidates_come_from_the_points_that_em_left_over(stepped):
@@ -188,6 +320,7 @@ def test_a_frame_that_is_not_tracked_leaves_the_map_bit_for_bit(state, settings,
     new, info = step(state, prediction, FULL, config)
     assert not info.localization.is_tracked and info.localization.reason > 0
     assert info.em.num_fused == 0 and info.em.num_points == 0 and info.refinement.num_fresh == 0
+    assert info.num_left_out == 0 and info.origin == state.time, "no point is one that no map can hold"
     sc.assert_same(new.map, state.map)
     # What is not to be mapped may still be what the next frame's coarse pose needs.
     seen = np.asarray(new.previous.valid)
@@ -198,9 +331,9 @@ def test_a_frame_that_is_not_tracked_leaves_the_map_bit_for_bit(state, settings,
 def odd(name: str) -> Prediction:
     """With a number that no prior should say."""
     given = exact(FRAME)
-    if name == "colour":
+    if name in COLOURS:
         colors = np.array(given.current.colors)
-        colors[5] = 1e30
+        colors[5] = COLOURS[name]
         return eqx.tree_at(lambda p: p.current.colors, given, sc.device(colors))
     if name in COVARIANCES:
         return eqx.tree_at(lambda p: p.pose_covariance, given, sc.device(np.stack([COVARIANCES[name]] * 2)))
@@ -208,6 +341,7 @@ def odd(name: str) -> Prediction:
     return eqx.tree_at(lambda p: p.T_world_anchor, given, jaxlie.SE3(sc.device(anchor)))
 
 
+COLOURS = {"colour": 1e30, "no colour": np.nan}  # the first is clipped
 COVARIANCES = {
     "negative variance": np.diag([1.0, 1.0, 1.0, -1e-3, 1e-4, 1e-4]),
     "errors that are one and the same": np.ones((6, 6)),
@@ -217,10 +351,11 @@ COVARIANCES = {
 
 
 @pytest.mark.parametrize("coarse", ["fused", "anchored"])
-@pytest.mark.parametrize("name", ["colour", "no rotation", "anchor beyond any map", *COVARIANCES])
+@pytest.mark.parametrize("name", [*COLOURS, "no rotation", "anchor beyond any map", *COVARIANCES])
 def test_whatever_a_prior_says_the_state_is_sound_and_the_next_frame_tracked(state, settings, name, coarse):
     config = sc.at(settings, "localization.coarse", COARSE.index(coarse))
     state, info = step(state, odd(name), FULL, config)
+    assert info.num_left_out == (name == "no colour")
     assert all(np.isfinite(x).all() for x in jax.tree.leaves((state, info.T_world_camera)))
     np.testing.assert_allclose(np.linalg.norm(state.T_world_previous.rotation().wxyz), 1.0, atol=1e-5)
     _, info = step(state, exact(FRAME + 1), FULL, config)
@@ -353,20 +488,39 @@ def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera):
     assert np.all(np.mean(ratios, axis=0) < 0.7), ratios
 
 
+SURE = {"pose_covariance": np.tile(1e-8 * np.eye(6), (2, 1, 1)), "scale_std": np.float32(1e-4)}
+
+
+def sloping(observation, camera):
+    """Depths that are 8 % too small at the left of the image, and as much too large at the right."""
+    slope = np.exp(np.linspace(-0.08, 0.08, camera.width))[None, :, None] * np.ones((camera.height, 1, 1))
+    return sc.replace(observation, points=observation.points * slope.reshape(-1, 1))
+
+
 def test_a_field_of_the_first_frames_fades_from_the_map(camera):
     """Three frames whose depths slope by 8 %, then eight that are exact, at exact poses: the map becomes their mean."""
     chosen = sc.changed(sc.slam_config(*WHOLE, "slam.em.average.gain=count"), **LENIENT)
     poses = [sc.path_pose(i) for i in range(FRAME)]
-    slope = np.exp(np.linspace(-0.08, 0.08, camera.width))[None, :, None] * np.ones((camera.height, 1, 1))
-    views = [sc.observe_room(T, camera, num_features=2) for T in poses]
-    views = [sc.replace(o, points=o.points * slope.reshape(-1, 1)) for o in views]
-    sure = {"pose_covariance": np.tile(1e-8 * np.eye(6), (2, 1, 1)), "scale_std": np.float32(1e-4)}
-    sequence = [sc.replace(exact(FRAME + i), **sure) for i in range(8)]
+    views = [sloping(sc.observe_room(T, camera, num_features=2), camera) for T in poses]
+    sequence = [sc.replace(exact(FRAME + i), **SURE) for i in range(8)]
     _, infos = run([sc.first_window(sc.stack(views), sc.stack_poses(poses)), *sequence], chosen)
     assert all(i.localization.is_tracked for i in infos)
     sizes = [float(np.abs(i.localization.icp.field.nodes).max()) for i in infos]
     assert 0.06 < sizes[0] < 0.1, "what the map differs from the frame"
     assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 0.5 * sizes[0], "3 of 11 frames are wrong"
+
+
+def test_a_map_that_no_frame_has_made_becomes_what_the_frame_shows_its_field_included(state, settings, camera):
+    """1 / (W + 1) of what they differ is the map's error, with W before this frame: of a map without weight all."""
+    now = eqx.tree_at(lambda s: s.map.weight, state, sc.device(np.zeros(ROOM)))
+    sizes = []
+    for i in range(2):
+        given = sc.replace(exact(FRAME + i), **SURE)
+        given = eqx.tree_at(lambda p: p.current, given, sloping(given.current, camera))
+        now, info = step(now, given, FULL, settings)
+        assert info.localization.is_tracked
+        sizes.append(float(np.abs(info.localization.icp.field.nodes).max()))
+    assert sizes[0] > 0.06 and sizes[1] < 0.3 * sizes[0]
 
 
 # What a step is compiled for.

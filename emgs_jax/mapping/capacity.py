@@ -171,8 +171,8 @@ def advance(
 ) -> tuple[SlamState, StepInfo, SlamConfig]:
     """Run one step; where a map or submap is full, double its capacity and repeat the frame.
 
-    That gives the same map as starting with the larger capacity. Splats beyond the tiles' capacity are only
-    counted: they change renderings, not the map. `step` is `slam.step`, or its form for stacked states.
+    That gives the same map as starting with the larger capacity. Splats beyond the tiles' capacity are only counted:
+    where they are missed the refinement makes new Gaussians. `step` is `slam.step`, or its form for stacked states.
     """
     new, info = step(state, prediction, camera, config)
     while np.any(info.overflow.map) or np.any(info.overflow.submap):

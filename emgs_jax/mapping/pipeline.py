@@ -110,7 +110,7 @@ def finish_run(run: MappingRun, is_interrupted: bool = False) -> MappingRun:
             run = with_atlas(run, finish_back_end(run.atlas, run.prior_query))
     if not run.records:
         return run
-    first = run.records[0].pose
+    first = next((record.pose for record in run.records if record.submap is None), run.records[0].pose)
     atlas, own = with_first_frame(run.atlas, first)
     return replace(with_atlas(run, rescale_atlas(atlas, first)), first_covariance=own)
 

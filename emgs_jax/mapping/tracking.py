@@ -78,9 +78,11 @@ def start_event(atlas: Atlas, window: WindowInput) -> Event:
         return Event(atlas.graph.nodes[-1].pose[None], is_start=True, num_gaussians=count, location=NEW_SUBMAP)
     poses = np.asarray(window.prediction.T_world_views.wxyz_xyz)
     if count == 0:  # no later frame could be localised in it
+        num_points = int(np.asarray(window.prediction.views.valid).sum())
         raise ValueError(
-            f"the map is empty after {len(poses)} view(s) from {window.frames[0].name}: the prior has no valid "
-            "point there; begin elsewhere (dataset.start=...) or use slam.initialization=merged"
+            f"the map is empty after {len(poses)} view(s) from {window.frames[0].name}: of {num_points} valid points "
+            "none become a Gaussian; begin elsewhere (dataset.start=...), use slam.initialization=merged, or make "
+            f"smaller Gaussians (slam.fit.points_per_gaussian={atlas.config.fit.points_per_gaussian} here)"
         )
     return Event(np.stack([to_matrix(pose) for pose in poses]), is_start=True, num_gaussians=count)
 

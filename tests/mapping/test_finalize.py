@@ -13,8 +13,9 @@ from scene import flat_gaussians, pose, random_gaussians, random_observation, sl
 
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.io.run_lengths import from_run_lengths, to_run_lengths
+from emgs_jax.mapping.atlas import Submap
 from emgs_jax.mapping.finalize import own_covariance, with_first_frame
-from emgs_jax.mapping.pipeline import with_atlas, with_looks_ended
+from emgs_jax.mapping.pipeline import finish_run, with_atlas, with_looks_ended
 from emgs_jax.mapping.records import FrameRecord, to_line
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.motion import no_looks
@@ -100,6 +101,16 @@ def test_frames_of_a_submap_that_was_never_joined_are_not_relative_to_the_first_
     nodes = [*atlas.graph.nodes[:2], *(replace(node, submap=1) for node in atlas.graph.nodes[2:])]
     found, own = with_first_frame(replace(atlas, graph=replace(atlas.graph, nodes=tuple(nodes))), np.eye(4))
     assert own.any() and found.graph.nodes[1] is not nodes[1] and found.graph.nodes[2] is nodes[2]
+
+
+def test_of_parts_that_never_met_the_first_frame_of_the_map_is_that_of_the_part_that_is_kept():
+    """It was that of the other part, from whose world no distance leads to the poses of the map."""
+    run = a_run()
+    nodes = [replace(node, submap=min(row, 1)) for row, node in enumerate(run.atlas.graph.nodes)]
+    graph, submaps = replace(run.atlas.graph, nodes=tuple(nodes), active=1), {k: Submap(run.state) for k in (0, 1)}
+    run = finish_run(replace(run, atlas=replace(run.atlas, graph=graph, submaps=submaps)))
+    assert run.records[0].submap == 0 and run.records[1].submap is None
+    np.testing.assert_allclose(run.records[1].covariance, 1e-4 * np.eye(6) + run.first_covariance, atol=1e-12)
 
 
 def test_poses_in_a_saved_map_are_not_relative_to_a_first_frame():

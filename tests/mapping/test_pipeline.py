@@ -165,6 +165,12 @@ def test_a_prior_without_any_point_is_an_error_and_not_a_run_that_never_maps():
         map_tiny(dataset(), EditedPrior(lambda prediction: replace(prediction, mask=prediction.mask & False)))
 
 
+def test_gaussians_that_are_larger_than_the_image_are_refused_by_their_key():
+    """A map without a Gaussian was said to be of a prior without a point."""
+    with pytest.raises(ValueError, match=r"of \d{3,} valid points .*slam\.fit\.points_per_gaussian=1000000"):
+        map_tiny(dataset(), EditedPrior(), "slam.fit.points_per_gaussian=1000000")
+
+
 def test_a_sequence_without_frames_is_refused():
     empty = Counting(0)
     empty.name, empty.sequence = "nothing", ""
