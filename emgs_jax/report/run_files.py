@@ -89,8 +89,13 @@ def _save_path_and_map(folder: Path, records: Sequence[FrameRecord], poses: Sequ
 
 
 def _complete_lines(path: Path, run: MappingRun) -> None:
-    """Complete frames.jsonl at the end of a run: add the first frame's covariance, mark frames that are left out."""
-    if not path.exists() or (run.first_covariance is None and all(r.reason != UNJOINED for r in run.records)):
+    """Complete frames.jsonl at the end of a run.
+
+    The first frame's covariance is added, frames that are left out are marked, and what later frames have shown to have
+    moved in each is written.
+    """
+    is_complete = all(record.reason != UNJOINED and record.moving_pixels is None for record in run.records)
+    if not path.exists() or (run.first_covariance is None and is_complete):
         return
     lines, records = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()], iter(run.records)
     uncertain = [line for line in lines if line["covariance"] is not None]
@@ -103,6 +108,8 @@ def _complete_lines(path: Path, run: MappingRun) -> None:
             line["covariance"] = (np.array(line["covariance"]) + covariance).tolist()
     for line in lines:
         record = None if line["status"] == "skipped" else next(records)
+        if record is not None and record.moving_pixels is not None:
+            line |= {"moving": record.moving, "moving_pixels": record.moving_pixels}
         if record is not None and record.reason == UNJOINED:
             line |= {name: getattr(record, name) for name in ("status", "reason", "submap")}
             line |= {} if record.status == APART else {"covariance": None}

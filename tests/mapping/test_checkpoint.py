@@ -42,6 +42,7 @@ from tools.kills.folders import log_lines
 GATES = ("slam.em.max_mahalanobis_sq=1", "slam.refinement.max_mahalanobis_sq_2d=1")
 OVERRIDES = ("prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=512", *GATES)
 GRAPH = ("graph=default", "graph.every=1")
+MOVING = ("slam/motion=default", "slam.motion.num_looks=2", "slam.motion.prior=1", "dataset.movers=1")
 SHOWS_TIMES = {"metrics.json", "frames.jsonl", "overview.png", "report.html"}
 
 
@@ -130,6 +131,7 @@ def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) 
         pytest.param(partial(in_step, 3, True), ("baseline=voxel",), range(1, NUM_FRAMES - 1), marks=pytest.mark.long),
         (in_export, (), range(1)),
         pytest.param(in_export, GRAPH, range(1), marks=pytest.mark.long),
+        pytest.param(partial(in_step, 3, True), MOVING, range(1, NUM_FRAMES - 1), marks=pytest.mark.long),
     ],
 )
 def test_a_run_that_is_stopped_and_goes_on_has_the_same_bits(tmp_path, monkeypatch, capsys, stop, more, num_steps):
@@ -138,6 +140,8 @@ def test_a_run_that_is_stopped_and_goes_on_has_the_same_bits(tmp_path, monkeypat
     assert (tmp_path / CHECKPOINT_FILE).exists()
     goes_on(tmp_path, more, num_steps, monkeypatch)
     assert "going on after frame" in "".join(capsys.readouterr())
+    if more == MOVING:  # what later frames said of an earlier one was known before the stop, and is afterwards
+        assert [line["moving"] > 0 for line in log_lines(tmp_path)][:4].count(True) >= 2
 
 
 @pytest.mark.slow
