@@ -25,9 +25,10 @@ from emgs_jax.data.apartment import Apartment
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.plan import APART
 from emgs_jax.geometry import pose_difference, scale_pose
+from emgs_jax.loop_closure import verification
 from emgs_jax.loop_closure.consistency import pairs_within, spatially_consistent
 from emgs_jax.loop_closure.place_recognition import Keyframe, make_keyframe
-from emgs_jax.loop_closure.two_view_alignment import Gate
+from emgs_jax.loop_closure.two_view_alignment import Gate, align
 from emgs_jax.loop_closure.two_view_refinement import Similarity
 from emgs_jax.loop_closure.verification import LoopMeasurement, Neighbour, free_space_violation, verify
 
@@ -169,6 +170,24 @@ def test_neighbours_that_are_not_verified_or_put_the_query_elsewhere_are_refused
         assert_refused(verify(b, a, [first, moved], verification_config()), Gate.NEIGHBOURS_DISAGREE)
 
 
+def test_neighbours_are_where_the_map_has_them_in_the_candidates_unit():
+    poses, log_scales = [np.eye(4), matrix((0, 0, 0), (2.0, 0, 0))], [0.4, 0.1]
+    candidate, other = (keyframe(room(), pose, frame) for frame, pose in enumerate(poses))
+    (found,) = verification.neighbours_of(candidate, [other], poses, log_scales)
+    np.testing.assert_allclose(found.T_candidate_neighbour[:3, 3], [2.0 * np.exp(-0.4), 0, 0], atol=1e-12)
+    assert found.log_ratio == pytest.approx(-0.3)
+
+
+def test_a_loop_is_weighted_by_the_inverse_of_its_covariance():
+    a, b, config = keyframe(room(), CANDIDATE, 3), keyframe(room(), QUERY, 500), verification_config()
+    loop, _ = verify(b, a, neighbours_of(room(), CANDIDATE), config)
+    covariance = align(a, b, config.alignment).similarity.covariance
+    std = np.sqrt(np.diag(covariance))
+    correlation = covariance / std / std[:, None]
+    weights = std[:, None] * (loop.sqrt_info.T @ loop.sqrt_info) * std
+    np.testing.assert_allclose(weights @ correlation, np.eye(7), atol=1e-6)
+
+
 def drifted_path(log_scale=0.0):
     """Poses of a lap that ends 1 m and 20° off, and of 4 frames that come back; and the loops that say so.
 
@@ -195,6 +214,10 @@ def test_loops_that_imply_one_correction_agree_and_one_that_does_not_is_alone(lo
     np.testing.assert_array_equal(spatially_consistent(loops, [], poses, scales, config), [True, True, False, True])
     turned = [loop(0, 501), loop(2, 503), loop(7, 508, matrix((0, 6, 0)))]
     assert not spatially_consistent(turned, [], poses, scales, config).any()
+    crossed = [loop(0, 511), loop(6, 506), loop(11, 501)]  # a metre apart on the path, to and fro
+    assert spatially_consistent(crossed, [], poses, scales, config).all()
+    # What violates free space is no witness, and one alone is nothing against.
+    assert not spatially_consistent(crossed[:2], crossed[2:], poses, scales, config).any()
     assert spatially_consistent([], [], poses, scales, config).shape == (0,)
 
 
@@ -267,6 +290,13 @@ def showing(depths, scale=1.0):
 
 def at(T, log_ratio=0.0):
     return Similarity(T, log_ratio, np.eye(7))
+
+
+def test_what_lies_behind_a_camera_and_where_it_knows_no_depth_says_nothing_of_free_space():
+    hall, shorter = np.full((24, 32), 6.0), np.full((24, 32), 4.0)
+    assert free_space_violation(showing(hall), showing(shorter), at(matrix((0, 180, 0))), 0.1) == 0
+    hall[:, :16] = 0.0
+    assert free_space_violation(showing(hall), showing(shorter), at(np.eye(4)), 0.1) == 1
 
 
 def test_a_wall_where_the_other_looks_through_is_a_contradiction_in_both_orders_in_one_unit_from_one_place():
