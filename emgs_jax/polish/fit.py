@@ -273,6 +273,11 @@ def _read(path: Path, state: State, signature: str) -> tuple[int, State]:
 
 
 def without_transparent(anchors: Anchors, fitted: Appearance, min_opacity: float) -> tuple[Anchors, Appearance]:
-    """The splats whose opacity is at least `min_opacity`."""
-    keep = np.asarray(jax.nn.sigmoid(fitted.logit)) >= min_opacity
+    """The splats whose opacity is at least `min_opacity`; ValueError where none is left."""
+    opacity = np.asarray(jax.nn.sigmoid(fitted.logit))
+    keep = opacity >= min_opacity
+    if not keep.any():
+        raise ValueError(
+            f"polish.min_opacity={min_opacity:g} leaves no splat: the largest opacity is {opacity.max(initial=0):.3g}"
+        )
     return jax.tree.map(lambda leaf: leaf[keep], (anchors, fitted))

@@ -21,7 +21,7 @@ from emgs_jax.config.configure import build
 from emgs_jax.data.spool import Spool
 from emgs_jax.io.run_lengths import to_run_lengths
 from emgs_jax.ops.camera import Camera
-from emgs_jax.polish.fit import Rates, Views, fit, is_held_out, place_on_splats
+from emgs_jax.polish.fit import Rates, Views, fit, is_held_out, place_on_splats, without_transparent
 from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, Shot, draw, gaussians_of, initial, loss, ssim
 from emgs_jax.report.finished_run import read_run
@@ -225,6 +225,14 @@ def test_a_fit_that_was_stopped_goes_on_to_the_same_bits(frames, tmp_path):
 
 def _arrays(found) -> list:
     return jax.tree.leaves((found[0], found[1]._replace(targets=None)))
+
+
+def test_a_fit_of_which_nothing_would_be_left_is_refused():
+    """A picture of no splat was a TypeError of a gather."""
+    anchors, fitted = sc.rows_of(ANCHORS, slice(3)), initial(jnp.zeros((3, 3)), jnp.float32(0.4))
+    with pytest.raises(ValueError, match=r"polish.min_opacity=1 leaves no splat: the largest opacity is 0.4"):
+        without_transparent(anchors, fitted, 1.0)
+    assert len(without_transparent(anchors, fitted, 0.3)[1].logit) == 3
 
 
 def test_ssim_is_one_of_equal_images_and_that_of_the_formula_in_a_slow_loop():
