@@ -143,12 +143,13 @@ LATER = {  # depth images, in the first of which pixels have moved as the others
     "a block that is hidden": ([HERE] * 2 + [with_block(1.0)] * 8, {}, NOTHING),
     "one that had moved by the looks before it": ([HERE] * 6, {"masks": [BLOCK] + [NOTHING] * 5}, BLOCK),
     "one that others take for moving where it stands": (
-        [HERE] * 4 + [WALL] * 4,
-        {"masks": [NOTHING] + [BLOCK] * 3 + [NOTHING] * 4},
+        [HERE] * 4 + [WALL] * 2,
+        {"masks": [NOTHING] + [BLOCK] * 3 + [NOTHING] * 2},
         BLOCK,
     ),
     "as little as one look": ([HERE, WALL], {}, NOTHING),
     "farther in each frame: a drift": ([WALL * 1.03**step for step in range(12)], {}, NOTHING),
+    "a drift that wavers": ([WALL * 1.03**step for step in (0, 2, 0, 4, 2, 6, 4, 8, 6, 10, 8, 12)], {}, NOTHING),
     "a noise that is not known": ([HERE] * 3 + [WALL] * 8, {"noise": 0.0}, NOTHING),
     "a pose that is not known": ([HERE] * 3 + [WALL] * 8, {"std": 0.5}, NOTHING),
 }
