@@ -114,3 +114,15 @@ def test_poses_in_a_saved_map_are_not_relative_to_a_first_frame():
     atlas = a_run().atlas
     atlas = replace(atlas, graph=replace(atlas.graph, first_node=1))
     assert with_first_frame(atlas, np.eye(4)) == (atlas, None)
+
+
+def test_how_far_the_last_frame_sees_is_said_by_its_valid_points_alone():
+    """The variance of a translation grows with the square of their mean depth, that of a rotation with none."""
+    run = a_run()
+    depths = np.asarray(random_observation(20).points)[:, 2]
+    is_near = depths < np.median(depths)
+    state = eqx.tree_at(lambda s: s.previous.valid, run.state, jnp.asarray(is_near))
+    own, of_all = (own_covariance(s, run.config.localization) for s in (state, run.state))
+    nearer = depths[is_near].mean() / depths.mean()
+    assert nearer < 0.9
+    np.testing.assert_allclose(np.diag(own) / np.diag(of_all), np.repeat([nearer**2, 1.0], 3), rtol=1e-4)
