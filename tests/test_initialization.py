@@ -6,7 +6,7 @@ import pytest
 import reference
 import scene as sc
 
-from emgs_jax.initialization import initialize
+from emgs_jax.initialization import initialize, merge
 
 pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
 
@@ -32,6 +32,16 @@ def test_there_are_num_points_over_lambda_and_views_gaussians(result):
 
 def test_the_weights_count_every_point_in_units_of_lambda(result):
     np.testing.assert_allclose(result[1].sum(), 3 * 768 / 8, rtol=1e-5)  # float32 sums
+
+
+def test_an_even_choice_of_the_merged_points_is_even_over_every_view(views, camera):
+    """Of its twelve blocks of 8 by 8 pixels each has 64 / 24 of every 24th point: two or three."""
+    _, _, order = merge(views, sc.stack_poses(POSES), camera)
+    view, pixel = np.divmod(np.asarray(order)[::24], 768)
+    y, x = np.divmod(pixel, camera.width)
+    counts = np.zeros((3, 3, 4), int)
+    np.add.at(counts, (view, y // 8, x // 8), 1)
+    assert counts.min() == 2 and counts.max() == 3
 
 
 def test_the_views_are_moved_to_the_world_by_the_priors_poses(result, views):

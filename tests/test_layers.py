@@ -39,7 +39,23 @@ def test_both_walls_move_half_way_and_the_other_is_fused_into_the_first(config):
     assert one.weight[valid].sum() == map.weight.sum() and np.asarray(one.num_updates)[valid].sum() == len(is_other)
     np.testing.assert_allclose(np.asarray(one.gaussians.normals)[taken], np.tile(NORMAL, (taken.sum(), 1)), atol=1e-6)
     across = np.asarray(one.gaussians.covs)[taken][:, 2, 2]
-    np.testing.assert_allclose(across, np.asarray(map.gaussians.covs)[0, 2, 2], rtol=1e-3), "no thicker by two layers"
+    before = np.asarray(map.gaussians.covs)[0, 2, 2]
+    np.testing.assert_allclose(across, before, rtol=1e-3, err_msg="no thicker by two layers")
+
+
+def test_what_is_fused_into_a_layer_makes_it_as_sure_as_the_surer_of_both_and_no_thicker(config):
+    """The other wall is rough by 3 mm: what it is moved by is a mean over neighbours, so that half of that stays."""
+    rough = 0.003 * np.where(np.arange(len(FIRST)) % 2, 1.0, -1.0)[:, None]
+    map, is_other = walls(FIRST, FIRST + [0, 0, GAP] + rough * [0, 0, 1])
+    existence = device(np.random.default_rng(0).uniform(0.5, 4.0, (2, len(FIRST))))
+    one = after(config, eqx.tree_at(lambda m: m.existence, map, existence.ravel()), is_other)
+    np.testing.assert_array_equal(one.gaussians.valid, ~is_other)
+    rows = np.flatnonzero(np.abs(FIRST[:, :2]).max(axis=1) < 0.65)
+    apart = np.asarray(one.gaussians.means)[rows, 2] - 3.0 - GAP / 2
+    assert (np.abs(apart) > 1e-3).all() and (apart > 0).any() and (apart < 0).any()
+    across = np.asarray(one.gaussians.covs)[rows][:, 2, 2]
+    np.testing.assert_allclose(across, np.asarray(map.gaussians.covs)[0, 2, 2], rtol=1e-3)
+    np.testing.assert_array_equal(np.asarray(one.existence)[~is_other], np.asarray(existence).max(axis=0))
 
 
 def test_what_only_one_of_both_shows_stays_and_no_step_is_between(config):

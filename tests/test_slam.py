@@ -592,6 +592,21 @@ def test_room_is_doubled_where_rows_did_not_fit(settings):
         assert (grown.map_capacity, grown.submap_capacity) == (room[0] * (1 + int(map)), room[1] * (1 + int(submap)))
 
 
+@pytest.mark.parametrize(
+    ("stage", "place", "factors"),
+    [("_store", lambda stored: stored[2], (2, 1)), ("_select", lambda submap: submap.overflow, (1, 2))],
+)
+def test_a_full_map_asks_for_room_in_the_map_and_a_full_submap_in_the_submap(
+    state, settings, monkeypatch, stage, place, factors
+):
+    """The stage that finds room says that a row had none."""
+    found = getattr(slam, stage)
+    monkeypatch.setattr(slam, stage, lambda *given: eqx.tree_at(place, found(*given), sc.device(np.int32(1))))
+    _, info = step(state, exact(FRAME), FULL, settings)
+    grown, room = grow_capacities(settings, info.overflow).submap, settings.submap
+    assert (grown.map_capacity / room.map_capacity, grown.submap_capacity / room.submap_capacity) == factors
+
+
 def test_a_frame_is_repeated_from_the_same_state_until_it_fits(state, stepped, settings):
     """By a step that says so below four times the room; a splat without room alone repeats nothing."""
     calls, prediction = [], exact(FRAME)

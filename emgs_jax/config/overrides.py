@@ -11,7 +11,8 @@ from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 
 KEY = re.compile(r"(?:\+{1,2}|~)?[A-Za-z_][\w./@:-]*=")
-NAMES = ("root", "sequence", "folder", "map", "out")  # keys whose values are names, though they may look like numbers
+# Keys whose values are names, though they may look like numbers: in any part of the settings, and by themselves.
+NAMES, WHOLE_NAMES = ("root", "sequence", "folder", "model", "trajectory"), ("map", "out")
 HOME = re.compile(r"(^|[,\[] ?)~(?=/)")  # shells leave it, zsh always, others in quotes
 OPENS = {"[": "]", "{": "}"}
 PLAIN = re.compile(r"[A-Za-z_][\w./-]*|/[\w./-]*")  # text that needs no quotes, but for these words
@@ -22,7 +23,8 @@ def readable(arguments: Sequence[str]) -> list[str]:
     """The words with every `key=value` quoted that means something else to Hydra, or nothing.
 
     A value is text where there is such a file or folder, and where the grammar has no place for its signs: spaces with
-    brackets, `=`, letters beyond ASCII. A list that a shell has cut at its spaces is put together, `~/` is the home.
+    brackets, `=`, letters beyond ASCII. A number stays one, unless the key is that of a name: folders are numbered. A
+    list that a shell has cut at its spaces is put together, `~/` is the home.
     """
     return [_readable(word) if KEY.match(word) else word for word in joined(arguments)]
 
@@ -68,8 +70,10 @@ def _readable(word: str) -> str:
             return f"{key}{','.join(map(quoted, items))}"
         whole = f"{key}{_quoted_items(value)}" if value[:1] + value[-1:] == "[]" and not _is_there(value) else ""
         return whole if whole and parsed(whole) is not None else f"{key}{quoted(value)}"
-    is_number = key[:-1].rpartition(".")[2] in NAMES and isinstance(found.value(), int | float | bool)
-    return f"{key}{quoted(value)}" if is_number or (_is_there(value) and found.value() != value) else word
+    is_name = key[:-1].rpartition(".")[2] in NAMES or key[:-1] in WHOLE_NAMES
+    is_number = isinstance(found.value(), int | float | bool)
+    is_text = is_name if is_number else _is_there(value) and found.value() != value
+    return f"{key}{quoted(value)}" if is_text else word
 
 
 def _is_there(value: str) -> bool:

@@ -28,6 +28,7 @@ from emgs_jax.back_end.optimization import (
     depth_noise_of,
     merge_duplicates_of_state,
     nodes_of,
+    one_layer_of_state,
 )
 from emgs_jax.back_end.state import BackEnd, Node, add_node, transform_nodes
 from emgs_jax.device.arrays import to_se3
@@ -503,8 +504,8 @@ def test_a_map_whose_visits_were_joined_is_settled_at_the_end_with_the_noise_of_
         np.testing.assert_allclose(poses, atlas.graph.poses, atol=1e-5)
 
 
-def test_a_gaussian_is_seen_from_the_node_of_its_birth(graph):
-    """Two sheets of a wall before the first node, and two that the second one sees from beside."""
+def sheets(graph, births, second=(0.0, 0.0, 0.0)) -> tuple[BackEnd, SlamState]:
+    """Two pairs of Gaussians 4 cm behind each other, 5 m apart, and two nodes, the second at a place given."""
     apart = [[0.0, 0, 3.0], [0, 0, 3.04], [5, 0, 3.0], [5, 0, 3.04]]
     cov, normal = jnp.diag(jnp.array([0.05, 0.05, 0.003])) ** 2, jnp.array([0.0, 0, -1])
     gaussians = random_gaussians(4)
@@ -512,11 +513,23 @@ def test_a_gaussian_is_seen_from_the_node_of_its_birth(graph):
     gaussians = eqx.tree_at(lambda g: (g.means, g.covs, g.normals), gaussians, rows)
     gaussians = eqx.tree_at(lambda g: g.features, gaussians, jnp.zeros((4, 0)))
     map = new_map(gaussians, jnp.ones(4), jnp.ones(()), jnp.asarray(0))
-    map = eqx.tree_at(lambda m: m.birth, map, jnp.array([0, 0, 1, 1], jnp.int32))
+    map = eqx.tree_at(lambda m: m.birth, map, jnp.asarray(births, jnp.int32))
     poses = np.tile(np.eye(4), (2, 1, 1))
-    poses[1, :3, 3] = 8.0, 0.0, 3.0
+    poses[1, :3, 3] = second
     nodes = tuple(Node(pose, pose, 0.0, row, depth_noise=0.02) for row, pose in enumerate(poses))
-    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01, nodes)
-    state = replace(state_of(ring()), map=map)
+    return BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01, nodes), replace(state_of(ring()), map=map)
+
+
+def test_a_gaussian_is_seen_from_the_node_of_its_birth(graph):
+    """Two sheets of a wall before the first node, and two that the second one sees from beside."""
+    end, state = sheets(graph, [0, 0, 1, 1], (8.0, 0.0, 3.0))
     after = merge_duplicates_of_state(state, end, load_config().slam.existence)
     np.testing.assert_array_equal(after.map.gaussians.valid, [True, False, True, True])
+
+
+def test_one_layer_has_the_rows_of_what_the_first_nodes_have_made(graph):
+    """Whichever of the two is nearer to the camera."""
+    end, state = sheets(graph, [0, 1, 1, 0])
+    after = one_layer_of_state(state, end, [False, True], load_config().slam.existence)
+    np.testing.assert_array_equal(after.map.gaussians.valid, [True, False, False, True])
+    np.testing.assert_allclose(np.asarray(after.map.gaussians.means)[[0, 3], 2], 3.02, atol=1e-5)

@@ -3,6 +3,7 @@
 from pathlib import Path
 
 import pytest
+from omegaconf import OmegaConf
 
 from emgs_jax.config.configure import compose
 from emgs_jax.config.overrides import joined, parsed, quoted, readable
@@ -42,6 +43,17 @@ def test_what_is_there_is_meant_even_where_it_could_be_a_list(name, tmp_path, mo
     before = parsed(readable([word])[0]).value()
     (tmp_path / name).mkdir()
     assert before != name and parsed(readable([word])[0]).value() == name
+
+
+@pytest.mark.parametrize("key", ["graph.noise.map", "prior.seed", "dataset.stride", "slam.fit.min_std"])
+def test_a_number_stays_one_whatever_its_key_ends_with_and_whatever_folders_there_are(key, tmp_path, monkeypatch):
+    """Symptom: `graph.noise.map=0.3` was text, and so was any number beside a folder of that name, as COLMAP's `1`."""
+    monkeypatch.chdir(tmp_path)
+    for value in ("1", "0.25"):
+        (tmp_path / value).mkdir()
+        assert OmegaConf.select(compose("graph=default", f"{key}={value}"), key) == float(value)
+    for name in ("map", "out", "dataset.sequence", "dataset.model", "prior.folder"):
+        assert parsed(readable([f"{name}=1"])[0]).value() == "1"
 
 
 def test_choices_of_a_multirun_are_files_each(tmp_path, monkeypatch):

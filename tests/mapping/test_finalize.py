@@ -120,7 +120,7 @@ def test_poses_in_a_saved_map_are_not_relative_to_a_first_frame():
 
 
 def test_what_the_last_frames_saw_move_is_taken_out_of_the_map_and_written_into_their_records():
-    """A frame before the last two has seen nine Gaussians where, as these show, something moved; eight others not."""
+    """The second frame of four has seen something move in a quarter of its pixels, as later ones have shown."""
     config = slam_config("slam.observation.thin=1", "slam.motion.num_looks=3", "slam/existence=default")
     camera, depth = Camera([20.0, 20.0], [7.5, 5.5], 16, 12), 2.0
     columns = np.indices((12, 16))[1].reshape(-1)
@@ -154,3 +154,15 @@ def test_what_the_last_frames_saw_move_is_taken_out_of_the_map_and_written_into_
     np.testing.assert_array_equal(mask, ((columns < 4) | (columns >= 12)).reshape(12, 16))
     assert after.state.looks is None
     assert with_looks_ended(after, 6).records == after.records
+
+
+def test_how_far_the_last_frame_sees_is_said_by_its_valid_points_alone():
+    """The variance of a translation grows with the square of their mean depth, that of a rotation with none."""
+    run = a_run()
+    depths = np.asarray(random_observation(20).points)[:, 2]
+    is_near = depths < np.median(depths)
+    state = eqx.tree_at(lambda s: s.previous.valid, run.state, jnp.asarray(is_near))
+    own, of_all = (own_covariance(s, run.config.localization) for s in (state, run.state))
+    nearer = depths[is_near].mean() / depths.mean()
+    assert nearer < 0.9
+    np.testing.assert_allclose(np.diag(own) / np.diag(of_all), np.repeat([nearer**2, 1.0], 3), rtol=1e-4)

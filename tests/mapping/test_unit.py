@@ -84,3 +84,10 @@ def test_a_map_in_the_priors_own_unit_keeps_every_bit():
     run = a_run(0.0)
     for atlas in (run.atlas, run_of(()).atlas):  # nothing was mapped
         assert rescale_atlas(atlas, np.eye(4)) is atlas
+
+
+def test_a_map_of_joined_submaps_keeps_its_unit():
+    """Each had one of its own, and the mean of the scales is that of the last one's inferences."""
+    run = a_run(LOG_SCALE)
+    atlas = replace(run.atlas, graph=replace(run.atlas.graph, has_one_unit=False))
+    assert rescale_atlas(atlas, run.records[0].pose) is atlas
