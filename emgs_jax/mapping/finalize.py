@@ -33,13 +33,12 @@ def end_looks(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[Sla
     """Take back what the last frames have said for Gaussians of things that moved: no later frame will say more.
 
     Args:
+        state: with looks.
         camera: of the full images.
 
     Returns:
-        The state, without looks, and those frames, on the host; none where nothing is taken for moving.
+        The state, without looks, and those frames, on the host.
     """
-    if state.looks is None:
-        return state, []
     map, seen = _end_looks(state, downscale(camera, config.observation.thin), config.existence)
     seen = jax.device_get(seen)
     each = [jax.tree.map(lambda leaf, row=row: leaf[row], seen) for row in np.flatnonzero(seen.time >= 0)]

@@ -117,7 +117,7 @@ def finish_run(run: MappingRun, is_interrupted: bool = False) -> MappingRun:
 
 def with_looks_ended(run: MappingRun, time: int) -> MappingRun:
     """Apply `end_looks` to a run after its last input; `time` is that of the frame of its last record."""
-    if run.state is None:
+    if run.state is None or run.state.looks is None:
         return run
     state, all_seen = end_looks(run.state, run.camera, run.config)
     view, records = downscale(run.camera, run.config.observation.thin), run.records
