@@ -14,21 +14,28 @@ from loop_scene import matrix
 from scene import assert_same, first_window, random_gaussians, random_observation
 
 import emgs_jax
+from emgs_jax.back_end.state import BackEnd, Node
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.localization import localize_coarse
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
+from emgs_jax.mapping import tracking
 from emgs_jax.mapping.atlas import Atlas, Submap, World, unvisited, with_state
 from emgs_jax.mapping.run import new_run
 from emgs_jax.mapping.tracking import (
     anchor_motion,
     anchor_world,
     as_step_prediction,
+    begin,
     is_relocalization_due,
     is_restart_due,
     move_prediction,
+    place_world,
     rejection,
     relocalized_start,
+    return_to_world,
+    step_event,
+    step_prediction,
 )
 from emgs_jax.motion import Looks
 from emgs_jax.observation import Prediction
@@ -148,6 +155,52 @@ def test_a_frame_of_its_own_is_where_the_camera_was_found_and_goes_with_it_from_
     np.testing.assert_allclose(world.T_world_prior @ own, PLACE, atol=1e-12)
     assert world.number == 2
     np.testing.assert_allclose(world.motion.as_matrix(), np.eye(4))  # None would stay behind in a closure
+
+
+def in_own_world(world: int = 2) -> SimpleNamespace:
+    """An input of frame 5, whose prior says the poses of three frames in a world of its own."""
+    own = {row: matrix((0, 10 * row, 0), (0.1 * row, 2, 3)) for row in (4, 5, 6)}
+    return SimpleNamespace(world=world, prediction=prediction(), frames=[SimpleNamespace(index=5)], T_anchor_views=own)
+
+
+def test_in_a_world_that_was_placed_the_prior_says_the_poses_of_its_frames_in_the_map():
+    given = in_own_world()
+    found, own = step_prediction(place_world(given, PLACE), given), given.T_anchor_views
+    expected = [PLACE @ np.linalg.inv(own[5]) @ own[row] for row in (4, 5, 6)]
+    np.testing.assert_allclose(found.T_world_views.as_matrix(), expected, atol=1e-5)
+    np.testing.assert_allclose(found.T_world_anchor.as_matrix(), PLACE, atol=1e-5)
+
+
+def a_graph() -> BackEnd:
+    return BackEnd(load_config("graph=default").graph, (1.0, 1.0, 0.0, 0.0), 0.0, (Node(PLACE, PLACE, 0.0, 0),))
+
+
+def test_a_world_that_comes_back_goes_on_at_the_time_of_the_run_and_knows_no_frame_before():
+    before = replace(lost_state(), time=jnp.asarray(5))
+    submaps = {0: Submap(before, worlds={0: World()}), 1: Submap(lost_state())}
+    atlas = Atlas(None, load_config().slam, replace(a_graph(), active=1), submaps, World(1))
+    found = return_to_world(atlas, in_own_world(0))
+    assert (found.graph.active, found.world.number, int(found.state.time)) == (0, 0, 12)
+    assert before.previous.valid.any() and not found.state.previous.valid.any()
+    assert found.submaps[1].worlds == {1: World(1)}, "where the run has been comes back, too"
+
+
+def test_a_map_of_its_own_is_of_the_frame_that_the_run_has_come_to(monkeypatch):
+    """Births are nodes: that of the frame before would move the new map with the old one."""
+    alone = replace(lost_state(), time=jnp.asarray(1))
+    monkeypatch.setattr(tracking, "start", lambda first, camera, config: (alone, config))
+    atlas = Atlas(None, load_config().slam, a_graph(), {0: Submap(lost_state())})
+    found = begin(atlas, in_own_world())
+    assert found.graph.active == 1 and int(found.state.time) == 12 + 1
+    assert (np.asarray(found.state.map.birth) == 12).all()
+
+
+@pytest.mark.parametrize(("is_frozen", "count"), [(False, 35), (True, 30)])
+def test_in_a_map_that_stays_what_a_step_would_have_made_is_not_counted(is_frozen, count):
+    of_step = SimpleNamespace(estimate=SimpleNamespace(covariance=np.eye(7)), by_map=np.eye(6), is_tracked=True)
+    info = SimpleNamespace(T_world_camera=to_se3(PLACE), num_gaussians=35, origin=0, localization=of_step)
+    atlas = Atlas(None, None, a_graph(), {0: Submap(lost_state(), is_frozen)})
+    assert step_event(atlas, info).num_gaussians == count
 
 
 def test_the_first_view_of_a_sequence_is_its_own_previous_one():
