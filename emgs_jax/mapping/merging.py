@@ -65,7 +65,7 @@ def beside(atlas: Atlas, other: Atlas) -> Atlas:
     rows = [*range(a), *range(a + b, num_a + b)], [*range(a, a + b), *range(num_a + b, num_a + num_b)]
     here, there = (renumbered(one, at, num_a + num_b) for one, at in zip((atlas, other), rows, strict=True))
     others = (
-        replace(node, submap=number if node.submap == other.graph.active else LEFT_OUT) for node in other.graph.nodes
+        replace(node, submap=number if node.submap == other.graph.active else LEFT_OUT) for node in there.graph.nodes
     )
     nodes = [*here.graph.nodes, *others]
     graphs = here.graph, there.graph
@@ -91,7 +91,7 @@ def with_lost(atlas: Atlas, lost: Sequence[Node]) -> Atlas:
 
 
 def renumbered(atlas: Atlas, rows: Sequence[int], count: int) -> Atlas:
-    """Give the nodes other numbers, among so many, wherever they are named; the nodes themselves stay as they are."""
+    """Give the nodes other numbers, among so many, wherever they are named; else the nodes stay as they are."""
     graph, new_births = atlas.graph, jnp.asarray(rows, jnp.int32)
 
     def at(one: Any) -> Any:
@@ -104,8 +104,10 @@ def renumbered(atlas: Atlas, rows: Sequence[int], count: int) -> Atlas:
         return replace(submap, state=replace(submap.state, map=map, time=jnp.asarray(count, jnp.int32)))
 
     keyframes = tuple(replace(one, frame=rows[one.frame]) for one in graph.database.keyframes)
+    nodes = tuple(one if one.origin is None else replace(one, origin=rows[one.origin]) for one in graph.nodes)
     graph = replace(
         graph,
+        nodes=nodes,
         database=replace(graph.database, keyframes=keyframes),
         **{name: [at(one) for one in getattr(graph, name)] for name in MEASURED},
     )
@@ -144,10 +146,13 @@ def placement(graph: BackEnd, number: int) -> tuple[Sim3, list[LoopMeasurement]]
 def implied(graph: BackEnd, loop: LoopMeasurement) -> Sim3:
     """Similarity that brings the query of a loop, and its unit, to where the candidate sees it."""
     here, there = graph.nodes[loop.a], graph.nodes[loop.b]
-    scale = float(np.exp(here.log_scale))
-    seen = here.pose @ scale_pose(loop.Z_a_b, scale)
-    cameras = (seen, scale * float(np.exp(loop.log_ratio))), (there.pose, float(np.exp(there.log_scale)))
-    to, of = (Sim3(size, pose[:3, :3], pose[:3, 3]) for pose, size in cameras)
+    seen = here.pose @ scale_pose(loop.Z_a_b, float(np.exp(here.log_scale)))
+    return motion(there, replace(there, pose=seen, log_scale=here.log_scale + loop.log_ratio))
+
+
+def motion(before: Node, after: Node) -> Sim3:
+    """Similarity that brings a node, and its unit, to where it is after."""
+    of, to = (Sim3(float(np.exp(one.log_scale)), one.pose[:3, :3], one.pose[:3, 3]) for one in (before, after))
     return to @ of.inverse()
 
 

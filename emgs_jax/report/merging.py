@@ -18,7 +18,7 @@ from emgs_jax.io.files import FrameLog, new_folder
 from emgs_jax.io.trajectory import from_tum
 from emgs_jax.mapping.atlas import Atlas, set_unjoined_apart, unvisited
 from emgs_jax.mapping.integrate import finish_back_end
-from emgs_jax.mapping.merging import beside, join, with_lost
+from emgs_jax.mapping.merging import beside, join, motion, with_lost
 from emgs_jax.mapping.records import FrameRecord, to_line, with_moved_nodes, with_unjoined_apart
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.ops.camera import Camera
@@ -88,7 +88,7 @@ def with_records(end: BackEnd, records: Sequence[FrameRecord], online: np.ndarra
     def told(node: Node, record: FrameRecord, pose: np.ndarray) -> Node:
         covariance = None if record.covariance is None else np.array(record.covariance)
         noise = record.depth_noise if record.status == "tracked" else None
-        return replace(node, online=pose, covariance=covariance, depth_noise=noise)
+        return replace(node, online=pose, covariance=covariance, depth_noise=noise, origin=record.origin)
 
     known = map(told, end.nodes[first:], records[lead:], online[lead:])
     return replace(end, nodes=(*end.nodes[:first], *known), first_node=first), lost
@@ -123,7 +123,24 @@ def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, l
     records = with_unjoined_apart(records, atlas.graph.nodes, kept=0)
     atlas = numbered(finish_back_end(atlas))
     records = with_moved_nodes(records, (), atlas.graph.nodes)
-    return MappingRun(atlas, records=records), order, reasons
+    return MappingRun(atlas, records=in_one_world(records, [runs[number] for number in order], atlas)), order, reasons
+
+
+def in_one_world(records: Sequence[FrameRecord], parts: Sequence[MergeableRun], atlas: Atlas) -> list[FrameRecord]:
+    """Write what the records say of other poses and nodes in the world and the numbers of the merged run.
+
+    The first frame of each run that is in its map was placed where the raw prior says, so both move alike.
+    """
+    found, nodes = [], atlas.graph.nodes[atlas.graph.first_node :]
+    for part in parts:
+        before, begin = part.atlas.graph.nodes[part.atlas.graph.first_node :], len(found)
+        first = next((row for row, node in enumerate(before) if node.is_placed), 0)
+        similarity = motion(before[first], nodes[begin + first])
+        for record, node in zip(records[begin : begin + len(before)], nodes[begin:], strict=False):
+            poses = {name: getattr(record, name) for name in ("raw_pose", "newest_pose")}
+            moved = {name: pose if pose is None else similarity.apply_to_poses(pose) for name, pose in poses.items()}
+            found.append(replace(record, origin=node.origin, **moved))
+    return found
 
 
 def numbered(atlas: Atlas) -> Atlas:

@@ -88,6 +88,19 @@ def test_a_merged_run_is_a_run_like_any_other_in_the_world_of_the_first(runs):
     assert saved.back_end.first_node == 40 and saved.count >= metrics_of(runs / "both")["map/num_gaussians"]
 
 
+def test_what_the_records_say_of_other_poses_and_frames_is_in_the_world_and_the_numbers_of_the_merged_run(runs):
+    """Symptom: the raw path and the origins of the second run were in its own world, unit and numbers."""
+    second, both = (read_run(runs / name) for name in ("second", "both"))
+    for own, line in zip(second.frames, both.frames[20:], strict=True):
+        assert line["origin"] == (None if own["origin"] is None else own["origin"] + 20)
+    np.testing.assert_allclose(second.raw[0], second.poses[0], atol=1e-6)
+    np.testing.assert_allclose(both.raw[20], both.poses[20], atol=1e-6)
+    own, moved = (np.linalg.norm(np.diff(raw[:, :3, 3], axis=0), axis=1) for raw in (second.raw, both.raw[20:]))
+    np.testing.assert_allclose(moved / own, 1 / UNIT, rtol=0.05)
+    distance, turn = pose_difference(both.raw[20:], both.poses[20:])
+    assert distance.max() < 0.2 and turn.max() < 5
+
+
 @cache
 def atlas(numbers: tuple[int, ...], *words: str) -> Atlas:
     frames = walk(numbers, *words)
