@@ -194,7 +194,7 @@ def placed_paths(run: FinishedRun) -> PlacedPaths:
     """Move the true path and the raw prior's to where they fit our path best; what is left of the difference.
 
     Each path is placed on the true one by itself, as for its error in metrics.json. Without truth the raw prior's path
-    stays where it is.
+    stays where it is; that of a run in a saved map, which is in a world and unit of its own, is placed on ours.
     """
     known, with_scale = run.has_truth, run.provenance["config"].get("evaluation", {}).get("alignment") == "sim3"
     back, raw, errors = None, run.raw, {}
@@ -205,5 +205,8 @@ def placed_paths(run: FinishedRun) -> PlacedPaths:
             errors[name] = np.linalg.norm(alignment.apply(poses[:, :3, 3]) - run.truth[:, :3, 3], axis=1)
             back = alignment.inverse() if back is None else back
             raw = back.apply_to_poses(alignment.apply_to_poses(poses)) if name == "raw" else raw
+    is_shown = run.is_placed & np.isfinite(run.raw).all((1, 2))
+    if back is None and run.provenance["config"].get("map") is not None and is_shown.any():
+        raw = align_poses(run.raw[is_shown], run.poses[is_shown], True)[0].apply_to_poses(run.raw)
     truth = run.truth if back is None else np.where(known[:, None, None], back.apply_to_poses(run.truth), np.nan)
     return PlacedPaths(truth, raw, errors)

@@ -192,6 +192,16 @@ def test_a_true_path_that_is_ours_in_another_frame_and_size_lies_on_ours(folder)
     assert np.nanmax(placed.errors["ours"]) < 1e-9
 
 
+def test_without_truth_the_raw_path_of_a_run_in_a_saved_map_is_placed_on_ours(folder):
+    run = read_run(folder)
+    raw = random_similarity(np.random.default_rng(0), 2.5).apply_to_poses(run.poses)
+    run = replace(run, truth=np.full_like(run.truth, np.nan), raw=raw)
+    np.testing.assert_array_equal(placed_paths(run).raw, raw)  # it began in one world with ours
+    config = run.provenance["config"] | {"map": "lab"}
+    run = replace(run, metrics=run.metrics | {"provenance": run.provenance | {"config": config}})
+    np.testing.assert_allclose(placed_paths(run).raw, run.poses, atol=1e-9)
+
+
 @pytest.mark.parametrize(
     ("metrics", "level"),
     [
