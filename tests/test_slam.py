@@ -207,6 +207,37 @@ def test_what_moves_is_as_if_it_had_no_points_but_hides_what_is_seen_through_and
     assert max(sc.pose_error(jaxlie.SE3(new.looks.T_previous_look.wxyz_xyz[1]), relative)) < 1e-6
 
 
+def test_a_look_that_is_over_takes_back_what_it_has_said_where_later_frames_show_that_something_moved(window, camera):
+    """Later frames have seen through a block of the oldest of three looks; a frame without points ends no look."""
+    config = lenient("slam/motion=default", "slam.motion.num_looks=3")
+    state, _ = init_state(window.views, window.T_world_views, FULL, config)
+    for prediction in small_steps(camera, 4):
+        state, _ = step(state, prediction, FULL, config)
+    *_, now = small_steps(camera, 5)
+    rows, columns = np.indices((camera.height, camera.width))
+    is_block = ((abs(rows - camera.height // 2) < 5) & (abs(columns - camera.width // 2) < 5)).ravel()
+    evidence = lambda s: (s.looks.log_odds, s.looks.step)  # noqa: E731
+    told = tuple(
+        leaf.at[-1].set(np.where(is_block, np.float32(x), leaf[-1]))
+        for leaf, x in zip(evidence(state), (-99.0, 9.0), strict=True)
+    )
+    other = eqx.tree_at(evidence, state, told)
+    (plain, _), (new, info) = (step(s, now, FULL, config) for s in (state, other))
+    assert info.seen.time == state.looks.time[-1] and new.looks.time[-1] == state.looks.time[-2]
+    moves = np.asarray(info.seen.moves)
+    assert moves[is_block].mean() > 0.6 and not moves[np.abs(rows - camera.height // 2).ravel() > 6].any()
+    lost = np.asarray(plain.map.existence - new.map.existence)[np.asarray(plain.map.gaussians.valid)]
+    is_back = lost > 1e-6
+    np.testing.assert_allclose(lost[is_back], config.existence.hit + config.existence.miss, rtol=1e-5)
+    assert 0 < is_back.sum() < 0.5 * len(is_back)
+    sc.assert_same(new.map.gaussians.means, plain.map.gaussians.means)
+
+    empty = eqx.tree_at(lambda p: p.current.valid, now, sc.device(np.zeros(now.current.valid.shape, bool)))
+    after, info = step(other, empty, FULL, config)
+    assert info.seen.time == -1 and not info.seen.moves.any()
+    np.testing.assert_array_equal(after.looks.time, state.looks.time)
+
+
 def test_a_frame_is_aligned_with_what_is_confirmed_alone(state, settings):
     """What is confirmed stands 5 cm before the walls, what is not where they are."""
     held = np.flatnonzero(state.map.gaussians.valid)

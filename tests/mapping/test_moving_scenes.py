@@ -56,6 +56,7 @@ def test_a_camera_that_stands_stays_where_it_is_and_maps_nothing_that_moves(case
     frames = stage(case)
     prior = build(compose("prior.level=0.5"), "prior", classes=list(frames.classes))
     run, _ = map_tiny(frames, prior, "slam/motion=default", "slam.motion.num_looks=8")
+    assert run.state.looks is None, "what the last frames saw is judged at the end"
     moves = np.array([(frame.moving == MOVES).mean() for frame in frames])
     said = np.array([record.moving or 0.0 for record in run.records])
     truth = frames.pose(0)
