@@ -15,6 +15,7 @@ from emgs_jax.data.raycast import RayCast, Scene
 from emgs_jax.data.synthetic import build_room, camera_path
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.mapping.records import HIDDEN
+from emgs_jax.report.moving import moving_mask
 
 NUM_FRAMES, HIDING = 20, range(8, 11)
 
@@ -71,6 +72,13 @@ def test_a_camera_that_stands_stays_where_it_is_and_maps_nothing_that_moves(case
     if case == "walks by":
         late = slice(8, None)
         assert said[late][moves[late] > 0.1].mean() > 0.5 * moves[late][moves[late] > 0.1].mean()
+        for shift, is_own in ((0, True), (1, False)):  # what is found later is written into its own frame's record
+            right = [
+                (frames[row + shift].moving == MOVES)[moving_mask(vars(run.records[row]), (64, 48))].mean()
+                for row in range(NUM_FRAMES - 1)
+                if said[row] > 0.05
+            ]
+            assert len(right) > 5 and (np.mean(right) > 0.8) == is_own, (shift, right)
     gaussians = confirmed(run.map)
     local = (np.asarray(gaussians.means) - truth[:3, 3]) @ truth[:3, :3]
     ahead = local[np.asarray(gaussians.valid)]

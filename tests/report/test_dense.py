@@ -68,6 +68,13 @@ def test_what_moves_gives_its_colour_to_nothing(run, dense):
     here = np.abs(dense.cloud.points[:, 0] - XS[1]) < 1.1
     still = np.abs(found.points[:, 0] - XS[1]) < 1.1
     assert (~here).sum() == (~still).sum() and 0.4 * here.sum() < still.sum() < 0.6 * here.sum()
+    said = np.full((len(STATUSES), 16, 24), 2.0, np.float32)
+    run_of_own = own_run(run, 1.0)
+    all_own = own_cloud(run_of_own, own_points(run, said))
+    run_of_own.records[1] = replace(run_of_own.records[1], moving_pixels=to_run_lengths(is_moving))
+    own = own_cloud(run_of_own, own_points(run, said))
+    counts = [[(np.abs(cloud.points[:, 0] - x) < 1.1).sum() for x in XS] for cloud in (all_own, own)]
+    assert 0.4 * counts[0][1] < counts[1][1] < 0.6 * counts[0][1] and counts[0][2:] == counts[1][2:]
 
 
 def test_the_points_are_the_walls_with_its_normals_and_the_images_colours(dense):
