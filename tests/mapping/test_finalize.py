@@ -2,8 +2,10 @@
 
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
@@ -15,7 +17,7 @@ from emgs_jax.gaussian_map import new_map
 from emgs_jax.io.run_lengths import from_run_lengths, to_run_lengths
 from emgs_jax.mapping.atlas import Submap
 from emgs_jax.mapping.finalize import own_covariance, with_first_frame
-from emgs_jax.mapping.pipeline import finish_run, with_atlas, with_looks_ended
+from emgs_jax.mapping.pipeline import finish_run, with_atlas, with_looks_ended, with_outcome
 from emgs_jax.mapping.records import FrameRecord, to_line
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.motion import no_looks
@@ -23,7 +25,7 @@ from emgs_jax.observation import transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.report.run_files import save_progress
-from emgs_jax.slam import SlamState
+from emgs_jax.slam import SlamState, as_seen
 from tools.nees.consistency import pose_errors
 
 COUNT = 1e6  # repeats beside which the guess does not count
@@ -144,6 +146,10 @@ def test_what_the_last_frames_saw_move_is_taken_out_of_the_map_and_written_into_
     state = SlamState(map, view, jaxlie.SE3.identity(), estimate, jnp.asarray(7), looks)
     run = run_of(records, state, config)
     run = replace(run, atlas=replace(run.atlas, camera=camera))
+    oldest = as_seen(jax.tree.map(lambda leaf: leaf[2], looks), state.T_world_previous, jnp.asarray(0.01))
+    info = SimpleNamespace(seen=jax.device_get(oldest), moving=np.zeros((12, 16), bool))
+    outcome = with_outcome(run, run.atlas, SimpleNamespace(info=info))
+    assert [record.moving for record in outcome.records] == [0.0, 0.5, 0.0, 0.0], "as a step says it that ends this"
     after = with_looks_ended(run, 6)  # of the record of the last frame
     settings = config.existence
     is_back = columns < 4
