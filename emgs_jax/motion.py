@@ -21,8 +21,8 @@ class MotionConfig(eqx.Module):
     """What tells a moving thing from the static scene and from a wrong prediction.
 
     Args:
-        num_looks: tracked frames before the current one that are compared with it; 0: nothing is taken for moving, as
-            printed. What stands still for about half as many becomes map.
+        num_looks: tracked frames before a frame, and after it, that are compared with it; 0: nothing is taken for
+            moving, as printed. What stands still for about half as many becomes map.
         hit: log-likelihood ratio, static to moving, of a look that shows a surface exactly where the point is.
         miss: the most that a look which shows free space there takes away: it may be a wrong prediction.
         prior: log-odds of static before any look.
