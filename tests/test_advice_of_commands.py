@@ -490,4 +490,6 @@ sound = sound_files(TABLES)
 
 @each_remedy(TABLES)
 def test_what_a_message_advises_helps(name, cause, message, remedy, sound, tmp_path):
+    if name == "tune":
+        pytest.importorskip("optuna", reason="the extra of emgs tune: pip install -e .[tune]")
     check_helps(TABLES[name][1], sound(name), cause, message, remedy, tmp_path)

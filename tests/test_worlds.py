@@ -137,6 +137,7 @@ densified = sc.on_host(lambda map, T, config: densify(map.gaussians, T, THINNED,
 
 def polished(world: World, map, poses: np.ndarray, folder: Path) -> tuple[list, np.ndarray, list]:
     """Densified views of the map, and splats that begin on them: counts, poses, and numbers without a unit."""
+    pytest.importorskip("optax", reason="the extra of emgs polish: pip install -e .[polish]")
     words = "polish.loss.render.tile_size=16", "polish.steps=4", "polish.pixels_per_splat=4"
     settings = build(configure.compose("folder=x", *words, name="polish"), "polish")
     drawing = DensifyConfig(0.05, 0.3, 0.01 * world.size, sc.slam_config(*WHOLE).refinement.render, "map")

@@ -48,6 +48,7 @@ WORDS_UPSTREAM = {
 
 
 def test_words_are_those_of_dino_txts_own_tokenizer_and_of_ftfy_and_regex_where_they_are_installed():
+    pytest.importorskip("tokenizers", reason="tokenizers reads texts: pip install -e .[features]")
     assert {text: words_of(text) for text in WORDS_UPSTREAM} == WORDS_UPSTREAM
     ftfy = pytest.importorskip("ftfy", reason="ftfy is the oracle")
     regex = pytest.importorskip("regex", reason="regex is the oracle")
@@ -58,6 +59,7 @@ def test_words_are_those_of_dino_txts_own_tokenizer_and_of_ftfy_and_regex_where_
 
 
 def test_pairs_merge_in_the_order_of_the_vocabulary_and_a_long_text_is_cut_before_its_end_mark(vocabulary):
+    pytest.importorskip("tokenizers", reason="tokenizers reads texts: pip install -e .[features]")
     number = 512 + len(MERGES)
     names = [*byte_symbols().values(), *(s + "</w>" for s in byte_symbols().values()), *MERGES]
     tokenizer = Tokenizer(vocabulary, number + 2, 6)
