@@ -71,19 +71,23 @@ def no_looks(view: Observation, config: MotionConfig) -> Looks | None:
     """
     if config.num_looks == 0:
         return None
-    size, poses = view.valid.shape[-1], jnp.tile(jaxlie.SE3.identity().wxyz_xyz, (config.num_looks, 1))
-    zeros, nothing = jnp.zeros((config.num_looks, size)), jnp.zeros((config.num_looks, size), bool)
-    return Looks(
-        points=jnp.zeros((config.num_looks, size, 3)),
-        depth=jnp.zeros((config.num_looks, 2, size)),
-        said=nothing,
-        moving=nothing,
-        log_odds=zeros,
-        free=zeros,
-        step=zeros,
-        time=jnp.full(config.num_looks, -1, jnp.int32),
-        T_previous_look=jaxlie.SE3(poses),
-    )
+    size, never = view.valid.shape[-1], jnp.asarray(-1, jnp.int32)
+    nothing = _first_look(jnp.zeros((size, 3)), jnp.zeros((2, size)), jnp.zeros(size, bool), never)
+    return jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (config.num_looks, *leaf.shape)), nothing)
+
+
+def _first_look(
+    points: Float[Array, "p 3"], depth: Float[Array, "2 p"], moving: Bool[Array, "p"], time: Int[Array, ""]
+) -> Looks:
+    """One look, of the last frame itself: no later one has said anything of it."""
+    zeros = jnp.zeros(moving.shape)
+    return Looks(points, depth, moving, moving, zeros, zeros, zeros, time, jaxlie.SE3.identity())
+
+
+def looks_from(looks: Looks, T_camera_previous: jaxlie.SE3) -> Looks:
+    """The looks where they are in the world, relative to a camera that takes the place of the last one."""
+    poses = jax.vmap(lambda T: (T_camera_previous @ jaxlie.SE3(T)).wxyz_xyz)(looks.T_previous_look.wxyz_xyz)
+    return replace(looks, T_previous_look=jaxlie.SE3(poses))
 
 
 @full_precision
@@ -107,23 +111,17 @@ def look_back(
         moving: its rows that move.
         estimate: of its pose, with the noise of its depths; where that is 0 it is not known, and nothing is said.
     """
-    T_camera_previous = T_world_camera.inverse() @ T_world_previous
-    poses = jax.vmap(lambda look: (T_camera_previous @ jaxlie.SE3(look)).wxyz_xyz)(looks.T_previous_look.wxyz_xyz)
+    looks = looks_from(looks, T_world_camera.inverse() @ T_world_previous)
     depth, evidence = jnp.nan_to_num(depth_range(view, T_world_camera, camera)), _evidence(estimate, camera, config)
-    ratios, free = jax.vmap(lambda points, T: evidence(jaxlie.SE3(T) @ points, depth, moving))(looks.points, poses)
+    ratios, free = jax.vmap(lambda points, T: evidence(jaxlie.SE3(T) @ points, depth, moving))(
+        looks.points, looks.T_previous_look.wxyz_xyz
+    )
     is_told = (looks.depth[:, 0] > 0) & (estimate.depth_noise > 0)
     log_odds = looks.log_odds + jnp.where(is_told, ratios, 0.0)
     free = jnp.where(is_told, jnp.maximum(free, looks.free), looks.free)
     step = jnp.maximum(looks.step, free - looks.free)
     moves = jax.vmap(lambda *told: _moves(*told, camera, config))(looks.depth[:, 0] > 0, log_odds, step)
-    return replace(
-        looks,
-        moving=looks.said | moves,
-        log_odds=log_odds,
-        free=free,
-        step=step,
-        T_previous_look=jaxlie.SE3(poses),
-    )
+    return replace(looks, moving=looks.said | moves, log_odds=log_odds, free=free, step=step)
 
 
 @full_precision
@@ -141,18 +139,8 @@ def look_again(
         view: the frame as it was aligned, world frame.
         moving: its rows that move.
     """
-    zeros = jnp.zeros(moving.shape)
-    newest = Looks(
-        points=jnp.where(view.valid[:, None], T_world_camera.inverse() @ view.points, 0.0),
-        depth=jnp.nan_to_num(depth_range(view, T_world_camera, camera)),
-        said=moving,
-        moving=moving,
-        log_odds=zeros,
-        free=zeros,
-        step=zeros,
-        time=time,
-        T_previous_look=jaxlie.SE3.identity(),
-    )
+    points = jnp.where(view.valid[:, None], T_world_camera.inverse() @ view.points, 0.0)
+    newest = _first_look(points, jnp.nan_to_num(depth_range(view, T_world_camera, camera)), moving, time)
     is_look = jnp.any(view.valid)
     return jax.tree.map(lambda new, old: jnp.where(is_look, jnp.concatenate([new[None], old[:-1]]), old), newest, looks)
 

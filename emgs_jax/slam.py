@@ -279,7 +279,9 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
     refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement)
     new = NewGaussians(fresh, weight, fused.halves)
-    looks, seen = _look(state.looks, frame, state.T_world_previous, view, config.motion)
+    looks, seen = None, None
+    if state.looks is not None:
+        looks, seen = _look(state.looks, frame, state.T_world_previous, view, config.motion)
     map, num_gaussians, overflow, time = _store(state.map, replace(submap, map=refined), new, frame, seen, view, config)
 
     info = StepInfo(
@@ -347,11 +349,9 @@ def _find_movers(
 
 @executable
 def _look(
-    looks: Looks | None, frame: Frame, T_world_previous: jaxlie.SE3, view: Camera, config: MotionConfig
-) -> tuple[Looks | None, Seen | None]:
+    looks: Looks, frame: Frame, T_world_previous: jaxlie.SE3, view: Camera, config: MotionConfig
+) -> tuple[Looks, Seen]:
     """The looks after a frame, and the one that is none any more, as the frames after it show it."""
-    if looks is None:
-        return None, None
     estimate, T = frame.localization.estimate, frame.T_world_camera
     told = look_back(looks, frame.seen, frame.moving, T, T_world_previous, estimate, view, config)
     after, is_over = look_again(told, frame.seen, frame.moving, T, frame.time, view), jnp.any(frame.seen.valid)

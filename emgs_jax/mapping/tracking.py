@@ -20,7 +20,7 @@ from emgs_jax.mapping.capacity import advance, restart_map, start
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.event import JOINED, NEW_SUBMAP, RELOCALIZED, RESTARTED, Event
 from emgs_jax.mapping.window_input import WindowInput
-from emgs_jax.motion import Looks
+from emgs_jax.motion import looks_from
 from emgs_jax.observation import Prediction, depth_in, no_covariance, transform, unknown_scale
 from emgs_jax.registration.rigid import pose_row, scale_translation
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
@@ -354,17 +354,11 @@ def relocalized_start(
     estimate = replace(state.estimate, covariance=covariance)
     if not is_same_unit:
         estimate = replace(estimate, log_scale=log_scale)
-    looks = _seen_from(state.looks, T.inverse() @ state.T_world_previous)
+    looks = state.looks
+    if looks is not None:
+        looks = looks_from(looks, T.inverse() @ state.T_world_previous)
     previous = transform(T, prediction.current, scale)
     return replace(state, previous=previous, T_world_previous=T, estimate=estimate, looks=looks), again
-
-
-def _seen_from(looks: Looks | None, T_camera_previous: jaxlie.SE3) -> Looks | None:
-    """The looks where they are in the world, relative to a camera that takes the place of the last one."""
-    if looks is None:
-        return None
-    there = jax.vmap(lambda T: (T_camera_previous @ jaxlie.SE3(T)).wxyz_xyz)(looks.T_previous_look.wxyz_xyz)
-    return replace(looks, T_previous_look=jaxlie.SE3(there))
 
 
 def rejection(
