@@ -1,6 +1,6 @@
 """Dense depth by a network for multi-view stereo, whose weights the user brings."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -27,7 +27,7 @@ MULTIPLE = 32  # of pixels; the networks halve their images five times
 jitted = cache(eqx.filter_jit)  # one for all priors of a process
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LearnedConfig(MatchedConfig):
     """Depth by a network.
 
@@ -38,11 +38,11 @@ class LearnedConfig(MatchedConfig):
         beside: the sweep, whose depths are taken where they are surer, and averaged where both agree.
     """
 
-    network: IterMVSConfig | EffiMVSConfig
-    magnification: float = number(low=0.01, high=16)
+    network: IterMVSConfig | EffiMVSConfig = field(default_factory=IterMVSConfig)
+    magnification: float = number(1.0, low=0.01, high=16)
     checkpoint: str | None
     sha256: str
-    beside: SweptConfig | None
+    beside: SweptConfig | None = None
 
 
 def grid_of(camera: Camera, magnification: float) -> Camera:

@@ -111,10 +111,10 @@ class ComputeConfig:
             result then depend.
     """
 
-    device: str | None
-    amp: str = one_of("bf16", "fp16", "float32")
-    memory_efficient: bool
-    minibatch_size: int | None = number(low=1)
+    device: str | None = None
+    amp: str = one_of("bf16", "fp16", "float32", default="bf16")
+    memory_efficient: bool = True
+    minibatch_size: int | None = number(1, low=1)
 
 
 class Network(Protocol):

@@ -34,13 +34,13 @@ class MaskConfig:
         consistent_depth_share: this fraction of the depth.
     """
 
-    drop_ambiguous: float = number(low=0, high=1)
-    confidence_percentile: float = number(low=0, high=100)
-    max_edge_step: float = number(low=0, high=math.inf)
-    max_edge_degrees: float = number(low=0, high=math.inf)
-    min_consistent_share: float = number(low=0, high=1)
-    consistent_depth_m: float = number(low=0, high=math.inf)
-    consistent_depth_share: float = number(low=0, high=math.inf)
+    drop_ambiguous: float = number(1.0, low=0, high=1)
+    confidence_percentile: float = number(0.0, low=0, high=100)
+    max_edge_step: float = number(0.03, low=0, high=math.inf)
+    max_edge_degrees: float = number(5.0, low=0, high=math.inf)
+    min_consistent_share: float = number(0.0, low=0, high=1)
+    consistent_depth_m: float = number(0.02, low=0, high=math.inf)
+    consistent_depth_share: float = number(0.02, low=0, high=math.inf)
 
 
 def usable(

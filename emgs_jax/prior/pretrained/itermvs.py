@@ -41,8 +41,8 @@ HEADS = {"hidden_init_head": (0, 2), "depth_head": (0, 2, 4), "confidence_head":
 SOURCE = "https://github.com/FangjinhuaWang/IterMVS (MIT), checkpoints/blendedmvs/model_000015.ckpt"
 
 
-def _steps() -> Any:
-    return eqx.field(static=True, converter=tuple, metadata=ranged(-256, 256))
+def _steps(*default: float) -> Any:
+    return eqx.field(default=default, static=True, converter=tuple, metadata=ranged(-256, 256))
 
 
 class IterMVSConfig(eqx.Module):
@@ -57,13 +57,13 @@ class IterMVSConfig(eqx.Module):
             of a scale, in 1/256 of the range.
     """
 
-    num_iterations: int = static(low=1, high=64)
-    num_groups: int = static(low=1, high=16)
-    num_initial: int = static(low=2, high=256)
-    window: int = static(low=0, high=128)
-    finest_steps: tuple[float, ...] = _steps()
-    middle_steps: tuple[float, ...] = _steps()
-    coarsest_steps: tuple[float, ...] = _steps()
+    num_iterations: int = static(4, low=1, high=64)
+    num_groups: int = static(8, low=1, high=16)
+    num_initial: int = static(32, low=2, high=256)
+    window: int = static(4, low=0, high=128)
+    finest_steps: tuple[float, ...] = _steps(-2.0, -0.6666667, 0.6666667, 2.0)
+    middle_steps: tuple[float, ...] = _steps(-8.0, -2.6666667, 2.6666667, 8.0)
+    coarsest_steps: tuple[float, ...] = _steps(-32.0, 32.0)
 
 
 def _double(image: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:
