@@ -44,9 +44,14 @@ SCHEMAS = {
 @cache
 def register() -> None:
     """Give Hydra the structured configs."""
-    for name, target in SCHEMAS.items():
+    for name in SCHEMAS:
         group, _, option = name.rpartition("/")
-        ConfigStore.instance().store(option, node_of(get_class(target)), group=group or None)
+        ConfigStore.instance().store(option, schema_of(name), group=group or None)
+
+
+def schema_of(name: str) -> dict[str, Any]:
+    """Return the node of a name in `SCHEMAS`."""
+    return node_of(get_class(SCHEMAS[name]))
 
 
 def node_of(cls: type, **given: Any) -> dict[str, Any]:
