@@ -27,6 +27,8 @@ from emgs_jax.report.gathering import RawPrior
 from emgs_jax.report.metrics import new_scorer, score_map, score_prior
 from emgs_jax.report.run_files import save_outputs
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 
 def same_bits(tree, other) -> bool:
     pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
@@ -141,7 +143,7 @@ def test_a_view_without_a_pose_cannot_be_merged():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_empty", [pytest.param(1, marks=pytest.mark.long), WINDOW_SIZE + 1])
+@pytest.mark.parametrize("num_empty", [pytest.param(1, marks=pytest.mark.weekly), WINDOW_SIZE + 1])
 def test_the_map_starts_at_the_first_frame_with_a_point_and_those_before_are_lost(num_empty):
     """All later frames were degraded, the map stayed empty and nothing said so."""
 

@@ -21,6 +21,8 @@ from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.io.trajectory import load_trajectory_tum
 from experiments.command import clear_errors
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 FILES = {"trajectory.txt", "map.npz", "map.ply", "points.ply", "mesh.ply", "frames.jsonl", "overview.png", "text.npz"}
 FILES |= {"report.html"}
 ERRORS = [f"{kind}_{size}cm_percent" for size in (20, 5) for kind in ("f1", "precision", "recall")]
