@@ -36,7 +36,7 @@ from experiments.score import score
 from experiments.segment import segment
 from experiments.view import view
 from tests.back_end.test_back_end import ring, walked
-from tests.messages import Step, check_messages, edit, gone, moved, put
+from tests.messages import Step, check_messages, gone, moved, put
 from tests.report.test_segmentation_table import moved_run, write_truth
 from tests.report.written_run import written_run
 from tests.scripts.test_evaluate import made_up
@@ -70,7 +70,6 @@ SPREAD = np.random.default_rng(0).normal(size=(99, 3))
 FAR = np.concatenate([SPREAD, [[1e9, 0, 0]]])
 TEXT_PLY = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
 CORNERS = "0 0 0\n1 0 0\n0 1 0\n"
-SE3 = {"evaluation.alignment": "se3"}
 
 
 OF_SCORE = [
@@ -89,7 +88,6 @@ OF_SCORE = [
     (cloud_of(SPREAD[:0]), "cloud.ply has no points: write the points of the map as PLY"),
     (cloud_of(FAR), "give the points in metres, and without stray ones"),
     (put(PLY, f"{TEXT_PLY}{CORNERS}nan 0 0\n"), "1 of 4 points are not finite .*: leave them out of the file"),
-    ((lambda root: read_score(root), SE3), r"choose another out=FOLDER"),
     ({"method": "a/b"}, "must be a name that is one folder below .*: choose another"),
 ]
 
@@ -105,11 +103,7 @@ def write_finished(root: Path) -> None:
     read_evaluation(root, OUT)
 
 
-OTHER = {"overrides": "'[slam.em.noise=0.3]'"}
-
-
 OF_EVALUATION = [
-    (OTHER, r"\(\+variants.NAME=\{KEY:VALUE\} of emgs evaluate, .*, choose another out=FOLDER or move the folder away"),
     ({"overrides": "'[prior.seed=3]'"}, r"give (seeds)=\[…\]"),
     ({"overrides": "'[dataset=tum]'"}, "give suite=NAME"),
     ({"overrides": "'[prior=multiview_stereo]'", "seeds": "'[0,1]'"}, r"give one seed, seeds=(\[0\])"),
@@ -130,16 +124,7 @@ def read_export(root: Path, **keys) -> list[Path]:
 OF_EXPORT = [
     ({"formats": "'[obj]'"}, "formats=obj is not known: choose of (colmap), nerfstudio"),
     ({"formats": "'[]'"}, "writes nothing: give (colmap), nerfstudio or frustums"),
-    ((put("run/colmap/x", ""), {"formats": "'[colmap]'"}), "colmap is there already"),
-    ({"scale": 2, "length": "'[0,1,2]'"}, "both say how long things are: give one of them"),
-    ({"length": "'[0,1]'"}, r"length must be \[frame,frame,metres\]"),
-    ({"length": "'[0,0,1]'"}, "at one place: take two that are far apart"),
-    ({"length": "'[0,3,1]'"}, r"frame 3 .*: take another one \(index in frames.jsonl\)"),
     ((gone("run/points.ply"), {"formats": "'[colmap]'"}), "lacks points.ply, which formats=colmap needs: run again"),
-    (
-        (edit("run/metrics.json", ('"fingerprint": "', '"fingerprint": "0')), {"formats": "'[colmap]'"}),
-        r"not those that were mapped. formats=(\[frustums\]) needs no images",
-    ),
     ({"images": "large", "formats": "'[colmap]'"}, "images must be one of (used), original"),
     (gone("run/metrics.json"), "finished run: it lacks metrics.json; run it to its end"),
 ]

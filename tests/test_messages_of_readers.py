@@ -575,10 +575,8 @@ OF_RECORDED = [
     (put(MANIFEST, "[]"), "is not of the format .*: record into another folder"),
     (edit(MANIFEST, ('"version": 3', '"version": 9')), "has version 9, .*: record into another folder"),
     (edit(MANIFEST, ('"version": 3', '"version": 2')), "SHA-256 does not fit.: record into another"),
-    (put(INFERENCE, b"PK"), "000001.npz is damaged .*experiments.predict.* makes what is missing or damaged"),
     (gone(INFERENCE), "000001.npz is missing: .*experiments.predict.* makes what is missing or damaged"),
     ({"size": 4}, "window_size 3, but this run has 4: .* or record into another folder"),
-    ({"stop": 4}, "recorded with num_frames 6"),
     ({"into": "recording"}, "holds a recording with provenance .*: choose another folder"),
 ]
 

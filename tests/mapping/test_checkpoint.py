@@ -124,7 +124,6 @@ def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) 
     assert {key: found[key] for key in same} == {key: metrics[key] for key in same}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stop", "more", "num_steps"),
     [
@@ -132,7 +131,7 @@ def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) 
         pytest.param(partial(in_step, 1, False), (), range(1, NUM_FRAMES - 1), marks=WEEKLY),
         pytest.param(partial(in_step, 3, False), GRAPH, range(1, NUM_FRAMES - 1), marks=WEEKLY),
         pytest.param(partial(in_step, 3, True), ("baseline=voxel",), range(1, NUM_FRAMES - 1), marks=WEEKLY),
-        (in_export, (), range(1)),
+        pytest.param(in_export, (), range(1), marks=pytest.mark.slow),
         pytest.param(in_export, GRAPH, range(1), marks=WEEKLY),
         pytest.param(partial(in_step, 3, True), MOVING, range(1, NUM_FRAMES - 1), marks=WEEKLY),
     ],
