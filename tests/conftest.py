@@ -35,7 +35,6 @@ import omegaconf._utils  # noqa: E402
 import pytest  # noqa: E402
 import yaml  # noqa: E402
 from jaxtyping import install_import_hook  # noqa: E402
-from schedule import SLOW, TESTS, in_order, scheduler  # noqa: E402
 
 # optax brings absl, whose handler closes the stream that it was made with, pytest's own, when Hydra sets up logging.
 absl.logging.get_absl_handler().python_handler.stream = sys.__stderr__
@@ -58,22 +57,17 @@ install_import_hook(
 )
 
 
-@pytest.hookimpl(tryfirst=True)  # before `-m` chooses
+@pytest.hookimpl(tryfirst=True)  # before `-m` chooses and xdist looks for groups
 def pytest_collection_modifyitems(config, items):
-    """Long tests are left out unless `-m` names them, and what shares executables stands together."""
-    for item in items:
-        if item.path.is_relative_to(TESTS) and item.path.relative_to(TESTS).as_posix() in SLOW:
-            item.add_marker("slow")
-    if "long" not in config.option.markexpr:
-        left_out = [item for item in items if item.get_closest_marker("long")]
+    """Weekly tests are left out unless `-m` names them; a file is one group, and groups of several files come first."""
+    if "weekly" not in config.option.markexpr:
+        left_out = [item for item in items if item.get_closest_marker("weekly")]
         config.hook.pytest_deselected(items=left_out)
         items[:] = [item for item in items if item not in set(left_out)]
-    items[:] = in_order(items)
-
-
-@pytest.hookimpl(optionalhook=True)
-def pytest_xdist_make_scheduler(config, log):
-    return scheduler(config, log)
+    items.sort(key=lambda item: item.get_closest_marker("xdist_group") is None)  # the longest, which are so marked
+    for item in items:
+        if item.get_closest_marker("xdist_group") is None:
+            item.add_marker(pytest.mark.xdist_group(item.path.stem))
 
 
 @pytest.fixture(scope="session", autouse=True)

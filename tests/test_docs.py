@@ -20,8 +20,6 @@ from experiments.evaluate import delegated
 ROOT = CONF.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "sweep", "tune", "protocol")
-pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-
 
 BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 
@@ -37,27 +35,35 @@ def slug(heading: str) -> str:
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
 
-@pages
-def test_links_lead_to_files_and_headings_that_are_there(page):
-    for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
-        target, _, heading = link.partition("#")
-        if not target.startswith("http"):
-            path = page.parent / target if target else page
-            assert path.exists(), link
-            slugs = {slug(line) for line in re.findall(r"^#+ (.*)$", path.read_text() if heading else "", re.MULTILINE)}
-            assert not heading or heading in slugs, link
+def test_links_lead_to_files_and_headings_that_are_there():
+    dead = []
+    for page in PAGES:
+        for link in re.findall(r"\]\(([^)\s]+)\)", page.read_text()):
+            target, _, heading = link.partition("#")
+            if not target.startswith("http"):
+                path = page.parent / target if target else page
+                text = path.read_text() if heading and path.exists() else ""
+                slugs = {slug(line) for line in re.findall(r"^#+ (.*)$", text, re.MULTILINE)}
+                if not path.exists() or (heading and heading not in slugs):
+                    dead.append(f"{page.name}: {link}")
+    assert not dead
 
 
-@pages
-def test_commands_options_and_files_are_there(page):
+def test_commands_options_and_files_are_there():
     """And infinity is `inf`, as a command line reads it; YAML's own `.inf` would be text there."""
-    for name in re.findall(r"(?:python -m experiments\.|\bemgs )([a-z]\w*)", code(page)):
-        assert importlib.util.find_spec(f"experiments.{name}"), name
-    for group, option in re.findall(rf"(?<![\w./])({'|'.join(GROUPS)}|slam/\w+)=([a-z]\w*)", code(page)):
-        assert (CONF / group / f"{option}.yaml").is_file(), f"{group}={option}"
-    for name in re.findall(r"^((?:emgs_jax|conf|tests|docs|notebooks|experiments)/[\w./]+)$", code(page), re.MULTILINE):
-        assert (ROOT / name).exists(), name
-    assert not re.search(r"=-?\.(inf|nan)", code(page))
+    unknown = []
+    for page in PAGES:
+        names = re.findall(r"(?:python -m experiments\.|\bemgs )([a-z]\w*)", code(page))
+        unknown += [
+            f"{page.name}: emgs {name}" for name in names if not importlib.util.find_spec(f"experiments.{name}")
+        ]
+        options = re.findall(rf"(?<![\w./])({'|'.join(GROUPS)}|slam/\w+)=([a-z]\w*)", code(page))
+        files = {f"{group}={option}": CONF / group / f"{option}.yaml" for group, option in options}
+        folders = "emgs_jax|conf|tests|docs|notebooks|experiments"
+        files |= {name: ROOT / name for name in re.findall(rf"^((?:{folders})/[\w./]+)$", code(page), re.MULTILINE)}
+        unknown += [f"{page.name}: {name}" for name, path in files.items() if not path.exists()]
+        unknown += [f"{page.name}: {word}" for word in re.findall(r"=-?\.(?:inf|nan)", code(page))]
+    assert not unknown
 
 
 def commands(page: Path) -> set[tuple[str, ...]]:
@@ -78,24 +84,29 @@ def commands(page: Path) -> set[tuple[str, ...]]:
 
 
 @pytest.mark.slow
-@pages
-def test_every_command_composes_its_config(page):
+def test_every_command_composes_its_config():
     """Keys, options and their values: those of what is named here, `mine/` aside, which test_extending.py runs."""
-    for name, *words in commands(page):
-        if words:
-            check_arguments("config" if name == "run" else name, readable(words))
+    wrong = {}
+    for words in sorted({words for page in PAGES for words in commands(page) if len(words) > 1}):
+        try:
+            check_arguments("config" if words[0] == "run" else words[0], readable(list(words[1:])))
+        except Exception as error:  # noqa: BLE001 (every wrong one at once)
+            wrong[" ".join(words)] = error
+    assert not wrong
 
 
-@pages
-def test_keys_of_the_stages_are_keys_of_the_config(page):
+def test_keys_of_the_stages_are_keys_of_the_config():
     """A key has a value after it, or is the whole span."""
-    config = OmegaConf.to_container(compose(), resolve=True)
-    keys = re.findall(r"\b((?:slam|render|densify|evaluation)\.[a-z_0-9.]+)[=:]", code(page))
-    for key in {*keys, *re.findall(r"^((?:slam)\.[a-z_0-9]+\.[a-z_0-9.]+)$", code(page), re.MULTILINE)}:
-        node = config
-        for name in key.split("."):
-            assert name in node, key
-            node = node[name]
+    config = compose()
+    unknown = []
+    for page in PAGES:
+        keys = re.findall(r"\b((?:slam|render|densify|evaluation)\.[a-z_0-9.]+)[=:]", code(page))
+        keys += re.findall(r"^((?:slam)\.[a-z_0-9]+\.[a-z_0-9.]+)$", code(page), re.MULTILINE)
+        for key in keys:
+            parent, _, last = key.rpartition(".")
+            if last not in (OmegaConf.select(config, parent) or {}):
+                unknown.append(f"{page.name}: {key}")
+    assert not unknown
 
 
 def test_the_documentation_lists_every_room_of_the_package():
@@ -108,20 +119,21 @@ def test_the_documentation_lists_every_room_of_the_package():
 
 def test_nothing_refers_to_pages_that_users_do_not_have():
     """`design/` and `reference/` are no folders of this project, and there is no path of a machine."""
-    for folder in ("emgs_jax", "experiments", "conf", "docs", "notebooks"):
-        for path in (ROOT / folder).rglob("*"):
-            if path.suffix in (".py", ".yaml", ".md", ".ipynb"):
-                assert not re.search(r"\b(design|reference)/\w|\bmethod\.md|/work/|\.\./shared", path.read_text()), path
+    private = re.compile(r"\b(design|reference)/\w|\bmethod\.md|/work/|\.\./shared")
+    folders = ("emgs_jax", "experiments", "conf", "docs", "notebooks")
+    paths = [path for folder in folders for path in (ROOT / folder).rglob("*")]
+    paths = [path for path in paths if path.suffix in (".py", ".yaml", ".md", ".ipynb")]
+    assert not [path for path in paths if private.search(path.read_text())]
 
 
 def test_instructions_are_short_and_have_no_history():
     """Measurements are dated and name their commits; they stand in docs/measurements/."""
-    for page in (ROOT / "docs").glob("*.md"):
-        text = page.read_text()
-        assert len(text.split()) <= 1500, page
-        assert not re.search(r"`(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,12}`", text), page
+    commit = re.compile(r"`(?=[a-f]*\d)(?=\d*[a-f])[0-9a-f]{7,12}`")
+    texts = {page.name: page.read_text() for page in (ROOT / "docs").glob("*.md")}
+    assert not [name for name, text in texts.items() if len(text.split()) > 1500 or commit.search(text)]
 
 
+@pytest.mark.slow
 def test_the_site_builds_without_a_warning_and_has_every_key_and_name(tmp_path):
     """As `mkdocs build --strict` does: every link and anchor is there, and so is every page of the navigation."""
     pytest.importorskip("mkdocs")

@@ -17,6 +17,8 @@ from emgs_jax.config.configure import CONF, groups
 from emgs_jax.config.configure import compose as compose_as_typed
 from emgs_jax.gaussian_map import GaussianMap
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
+
 PACKAGE = Path(emgs_jax.__file__).parent
 NO_MARK = """
 import sys

@@ -72,7 +72,7 @@ def test_a_sound_input_that_is_refused_ends_the_harness(tmp_path):
         verdict(tmp_path, read)
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_a_process_that_dies_is_one_fault_and_the_next_case_goes_on(monkeypatch, tmp_path):
     program = tmp_path / "python"
     program.write_text(

@@ -9,8 +9,6 @@ from emgs_jax.gaussians import blend, cluster, color_gradients, empty_gaussians,
 from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.clustering import morton_order
 
-pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
-
 fit, gradients_of, clustered, blended = (sc.on_host(f) for f in (fit_to_points, color_gradients, cluster, blend))
 NUM_POINTS, NUM_CENTERS, NUM_FEATURES = 200, 20, 4  # of every fit: one program for all
 PIXELS, ORDER = 768, np.asarray(morton_order(24, 32))

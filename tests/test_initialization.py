@@ -8,8 +8,6 @@ import scene as sc
 
 from emgs_jax.initialization import initialize, merge
 
-pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
-
 first_map = sc.on_host(initialize)
 POSES = [sc.path_pose(i) for i in range(3)]
 

@@ -17,8 +17,6 @@ from emgs_jax.registration.pose_noise import no_repeats
 from emgs_jax.registration.problem import CoarseStart
 from emgs_jax.registration.repeated_prediction import repeat_scale
 
-pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
-
 coarse_step, fine_step, solve = (sc.on_host(f) for f in (localize_coarse, localize_fine, icp))
 COARSE = {"via_previous": 0, "same_image": 1, "anchored": 2, "fused": 3}
 SCALES = {"none": 0, "ratio": 1, "estimated": 2}

@@ -7,6 +7,8 @@ import pytest
 from tools.mutants.choose import ROOT, by_hand, compiles, is_core, nearest_tests, sample
 from tools.mutants.operators import changed, edits
 
+pytestmark = pytest.mark.slow
+
 LINES = {  # each line, and all that a generator makes of it
     "x = a < len(b)": ["x = a <= len(b)"],
     "x = a < b": ["x = a >= b"],

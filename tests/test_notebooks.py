@@ -12,6 +12,8 @@ from tiny_run import TINY
 
 from tools.notebooks.__main__ import OUTPUTS_OF, code_digest
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
 IDS = [path.stem for path in NOTEBOOKS]
 AXES = "grid=one_at_a_time axes={slam.em.support:[printed,normalized],slam.em.noise:[0.0,1.0]}"
@@ -87,7 +89,7 @@ def test_one_step_taken_apart_is_the_step(monkeypatch, tmp_path):
     assert abs(grown - int(found["refined"].num_fresh)) <= 10
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_the_readings_are_compared_seed_by_seed_and_loaded_when_run_again(monkeypatch, tmp_path):
     found = execute(2, " ".join((*TINY, AXES)), monkeypatch, tmp_path)
     changes = [(effect.key, effect.value) for effect in found["effects"]]
@@ -102,7 +104,7 @@ def table_of(variables: dict) -> str:
     return variables["table"](variables["effects"])
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_the_heat_maps_show_the_metrics_of_each_setting_at_its_place(monkeypatch, tmp_path):
     found = execute(3, " ".join((*TINY, GRID)), monkeypatch, tmp_path)
     drawn = found["values"]("trajectory/ate_sim3_m")
@@ -112,7 +114,7 @@ def test_the_heat_maps_show_the_metrics_of_each_setting_at_its_place(monkeypatch
     assert len(np.unique(drawn)) == 4
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_own_images_become_a_map_of_the_room_that_they_show(monkeypatch, tmp_path):
     """Oracle: the true path of the camera, up to the scale that images do not tell."""
     small = "slam.window_size=4 dataset.size=[160,120] slam.submap.map_capacity=4096 slam.submap.submap_capacity=2048"
@@ -127,7 +129,7 @@ def test_own_images_become_a_map_of_the_room_that_they_show(monkeypatch, tmp_pat
     assert html.unescape(found["report"].data).count((found["results"] / "report.html").read_text()) == 1
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_wrong_features_cost_classes_and_move_geometry_only_where_they_have_a_weight(monkeypatch, tmp_path):
     """Oracle: where nothing looks at features but the layers' sign, wrong ones move nothing but that."""
     # The prior is exact: 1 cm of error over 40 cm of path turns a noisy map until classes fall beside their things.

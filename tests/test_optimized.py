@@ -69,7 +69,7 @@ def test_an_update_is_that_of_equations_2_to_4():
     assert len(apart) > 100 and np.quantile(apart, 0.98) < 1e-3
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_an_image_is_that_of_every_gaussian_at_every_pixel(camera):
     config = sc.slam_config().refinement.render
     g = sc.random_gaussians(60, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
@@ -105,7 +105,7 @@ def test_normals_are_those_of_least_squares_over_the_window():
         assert normals[row, column] @ expected > np.cos(np.radians(0.05))
 
 
-@pytest.mark.long  # compiles for half a minute
+@pytest.mark.weekly  # compiles for half a minute
 def test_the_fine_step_finds_the_pose_in_a_closed_room():
     """From 5 cm and 2 degrees, among discs on the walls where another view has its pixels."""
     view, T = Camera([60.0, 66.0], [39.5, 30.25], 80, 64), sc.path_pose(3)

@@ -4,7 +4,6 @@ import tomllib
 from pathlib import Path
 
 import pytest
-from schedule import GROUPS, SLOW, TESTS
 
 from emgs_jax.config.configure import CONF
 from experiments.cli import COMMANDS, main, usage
@@ -61,8 +60,3 @@ def test_every_command_is_listed_with_an_example_and_an_unknown_one_is_named(mon
     monkeypatch.setattr("sys.argv", ["emgs", "fly"])
     with pytest.raises(SystemExit, match="fly is no command of emgs: choose one of run, evaluate"):
         main()
-
-
-def test_the_groups_of_test_files_name_files_that_are_there_and_each_once():
-    names = [name for group in GROUPS.values() for name in group]
-    assert len(set(names)) == len(names) and all((TESTS / name).is_file() for name in (*names, *SLOW))

@@ -11,8 +11,6 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.refinement import match_on_image, refine
 from emgs_jax.render.project import Splats
 
-pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
-
 refined, matched = map(sc.on_host, (refine, match_on_image))
 CAMERA_POSE = sc.pose()
 NUM_MAP, NUM_NEW = 104, 40  # rows of every map and of all candidates, most of which are free: one program for all

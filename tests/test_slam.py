@@ -20,7 +20,7 @@ from emgs_jax.ops.executable import calling
 from emgs_jax.slam import Overflow, StepInfo
 
 FRAME = 3
-pytestmark = pytest.mark.slow  # one compilation of the whole step is half a minute
+pytestmark = pytest.mark.xdist_group("small")
 # With executables that are kept, as runs have them: those that test_growth.py compiled.
 init_state, step = (calling(call)(function) for function in (slam.init_state, slam.step))
 # An exact chain, lenient checks: the room is coarse at this resolution.
@@ -457,7 +457,7 @@ def predictions(window, count):
     "capacities",
     [
         (ROOM // 2, 256),
-        pytest.param((64, 64), marks=pytest.mark.long),
+        pytest.param((64, 64), marks=pytest.mark.weekly),
     ],  # each new size of the submap compiles the whole step
 )
 def test_growing_on_the_way_gives_the_same_map_as_starting_large(window, capacities):

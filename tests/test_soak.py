@@ -11,13 +11,15 @@ from tests.hand_run import hand_run, poses_along
 from tools.soak.scenes import NUM_FRAMES, SCENES, ToAndFro, to_and_fro
 from tools.soak.soak import faults, grown, ratio, soak
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 SHORT = 14
 USUAL = "black frames"
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "name", [USUAL, *(pytest.param(name, marks=pytest.mark.long) for name in SCENES if name != USUAL)]
+    "name", [USUAL, *(pytest.param(name, marks=pytest.mark.weekly) for name in SCENES if name != USUAL)]
 )
 def test_no_scene_poisons_the_map_and_every_frame_has_a_status(name):
     run, curves = soak(ToAndFro(SHORT, *SCENES[name]))

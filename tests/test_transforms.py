@@ -15,7 +15,7 @@ from scene import stack
 from verbs import FORWARD, INSIDE_ANOTHER, LOOSE, ROWS_TOGETHER, VERBS
 
 pytestmark = pytest.mark.slow  # every verb is compiled twice: minutes
-NAMES = [pytest.param(name, marks=pytest.mark.long if name in INSIDE_ANOTHER | FORWARD else ()) for name in VERBS]
+NAMES = [pytest.param(name, marks=pytest.mark.weekly if name in INSIDE_ANOTHER | FORWARD else ()) for name in VERBS]
 STEPS = (1e-3, 3e-4)  # parts of each array's largest entry; float32 rounds a quotient by the second to 2e-4
 
 

@@ -48,7 +48,7 @@ from emgs_jax.pose_graph.optimize import PoseGraphConfig, optimize
 from emgs_jax.render.densify import DensifyConfig, densify
 from emgs_jax.structure.model import to_structure
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("small")]
 VIEWS, STEPS, SEED = 3, 10, 2
 COUNT = VIEWS + STEPS
 ELSEWHERE = (0.7, 0.2, -0.4), (600.0, -700.0, 400.0)  # a turn, and a kilometre: float32 has steps of .06 mm there

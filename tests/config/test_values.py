@@ -18,6 +18,8 @@ from emgs_jax.ops.ranges import number
 from emgs_jax.sequence import load_config
 from experiments.grid import read_axes, variants
 
+pytestmark = pytest.mark.slow
+
 GROUPS = groups()
 PARTS = ("slam", "densify", "evaluation", "graph", "dataset", "prior", "features", "baseline.voxel", "baseline.tsdf")
 

@@ -10,6 +10,8 @@ from emgs_jax.data.apartment import Apartment
 from emgs_jax.data.plan import APART, BAY, WALL, Area, Plan, draw_plan
 from emgs_jax.data.walks import WALKS
 
+pytestmark = pytest.mark.slow
+
 SEEDS_AND_WALKS = [*((0, walk) for walk in WALKS), (1, "two_laps"), (1, "twin_rooms")]
 
 

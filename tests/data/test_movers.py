@@ -12,6 +12,8 @@ from emgs_jax.data.base import ELSEWHERE, MOVES, STAYS
 from emgs_jax.data.movers import Doorway, Lane, build_movers
 from emgs_jax.data.synthetic import Synthetic
 
+pytestmark = pytest.mark.slow
+
 SCENES = {"room": (Synthetic, {}), "flat": (Apartment, {"num_frames": 60}), "hall": (Apartment, {"walk": "corridor"})}
 
 

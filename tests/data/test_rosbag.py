@@ -16,6 +16,8 @@ from emgs_jax.data.rosbag import RECTIFIED, RosBag, to_rgb, when_taken
 rosbags = pytest.importorskip("rosbags", reason="reads bags: pip install -e .[rosbag]")
 from tests.data.written_bag import SIZE, D, K, P, write_bag  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize("lens", [("plumb_bob", D), ("equidistant", D[:4], "OPENCV_FISHEYE")], ids=lambda lens: lens[0])
 @pytest.mark.parametrize("version", [1, 2])

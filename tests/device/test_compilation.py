@@ -9,6 +9,8 @@ import pytest
 
 from emgs_jax.device.settings import cache_folder
 
+pytestmark = pytest.mark.slow
+
 PROGRAM = """
 import sys
 import jax, jax.numpy as jnp

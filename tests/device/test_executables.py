@@ -35,6 +35,8 @@ from emgs_jax.ops.executable import calling
 from emgs_jax.ops.pytree import stack
 from emgs_jax.slam import step
 
+pytestmark = pytest.mark.slow
+
 TRACES = []
 ROOM = 3.0  # a number of the module, as thresholds of a stage that are no config
 
@@ -314,7 +316,7 @@ def test_a_new_process_that_lowers_nothing_finds_lapack(tmp_path):
     assert len(entries(tmp_path)) == 2
 
 
-@pytest.mark.long  # the whole step is compiled twice
+@pytest.mark.weekly  # the whole step is compiled twice
 def test_a_step_of_kept_executables_has_the_bits_of_a_step_without(folder, camera):
     config = slam_config("slam.initialization=merged")
     poses = [path_pose(i) for i in range(3)]

@@ -21,6 +21,8 @@ from emgs_jax.features.images import ImageConfig, network_input  # noqa: E402
 from emgs_jax.features.text import save_text  # noqa: E402
 from emgs_jax.features.tokens import Tokenizer  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 KINDS = {"dinov3_text": (dinov3, True, 16), "dinov2_text": (dinov2, False, 14)}
 MEAN, STD = [0.485, 0.456, 0.406], [0.229, 0.224, 0.225]
 PLAIN = np.full((60, 100, 3), 90, np.uint8)

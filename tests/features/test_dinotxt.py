@@ -9,6 +9,8 @@ from tiny_dino import NUM_HEADS, random_head, random_text_encoder  # noqa: E402
 
 from emgs_jax.features.dinotxt import text_tower, vision_head  # noqa: E402
 
+pytestmark = pytest.mark.slow
+
 DIM = 16
 
 

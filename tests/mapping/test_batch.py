@@ -15,6 +15,8 @@ from emgs_jax.mapping.run import MappingRun
 from emgs_jax.mapping.window_input import RawView, WindowInput
 from emgs_jax.ops.pytree import stack
 
+pytestmark = pytest.mark.xdist_group("small")
+
 WHOLE = ("slam.localization.coarse=same_image", "slam.initialization=merged")
 FRAME = 3
 
@@ -61,7 +63,7 @@ def runs_of(camera, configs) -> list[MappingRun]:
     return [MappingRun(Atlas(camera, config, BackEnd(None, (1.0, 1.0, 0.0, 0.0), 0.0))) for config in configs]
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_every_setting_of_a_stack_is_what_a_run_with_it_gives_and_all_grow_when_one_is_full(sequence, camera):
     configs, roomy = (
         [at(at(base, "em.max_mahalanobis_sq", x), "refinement.max_mahalanobis_sq_2d", x) for x in (0.0, 4.6, 20.0)]

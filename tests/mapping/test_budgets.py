@@ -18,7 +18,7 @@ import experiments.run
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.device import executables
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
 
 
 @contextlib.contextmanager

@@ -15,7 +15,7 @@ from emgs_jax.gaussian_map import grow
 from emgs_jax.mapping.capacity import advance, prepare_step, start
 from emgs_jax.ops.pytree import stack
 
-pytestmark = pytest.mark.slow  # the whole step is compiled
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("small")]  # the whole step is compiled
 
 
 @pytest.fixture(scope="module")

@@ -38,8 +38,11 @@ from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.slam import SlamState
 from tools.kills.folders import log_lines
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 # Strict gates, so that the map outgrows half the capacity of tiny_run, and has the shapes of its runs then.
 GATES = ("slam.em.max_mahalanobis_sq=1", "slam.refinement.max_mahalanobis_sq_2d=1")
+WEEKLY = pytest.mark.weekly
 OVERRIDES = ("prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=512", *GATES)
 GRAPH = ("graph=default", "graph.every=1")
 MOVING = ("slam/motion=default", "slam.motion.num_looks=2", "slam.motion.prior=1", "dataset.movers=1")
@@ -121,17 +124,16 @@ def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) 
     assert {key: found[key] for key in same} == {key: metrics[key] for key in same}
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     ("stop", "more", "num_steps"),
     [
         (partial(in_step, 3, True), (), range(1, NUM_FRAMES - 1)),
-        pytest.param(partial(in_step, 1, False), (), range(1, NUM_FRAMES - 1), marks=pytest.mark.long),
-        pytest.param(partial(in_step, 3, False), GRAPH, range(1, NUM_FRAMES - 1), marks=pytest.mark.long),
-        pytest.param(partial(in_step, 3, True), ("baseline=voxel",), range(1, NUM_FRAMES - 1), marks=pytest.mark.long),
-        (in_export, (), range(1)),
-        pytest.param(in_export, GRAPH, range(1), marks=pytest.mark.long),
-        pytest.param(partial(in_step, 3, True), MOVING, range(1, NUM_FRAMES - 1), marks=pytest.mark.long),
+        pytest.param(partial(in_step, 1, False), (), range(1, NUM_FRAMES - 1), marks=WEEKLY),
+        pytest.param(partial(in_step, 3, False), GRAPH, range(1, NUM_FRAMES - 1), marks=WEEKLY),
+        pytest.param(partial(in_step, 3, True), ("baseline=voxel",), range(1, NUM_FRAMES - 1), marks=WEEKLY),
+        pytest.param(in_export, (), range(1), marks=pytest.mark.slow),
+        pytest.param(in_export, GRAPH, range(1), marks=WEEKLY),
+        pytest.param(partial(in_step, 3, True), MOVING, range(1, NUM_FRAMES - 1), marks=WEEKLY),
     ],
 )
 def test_a_run_that_is_stopped_and_goes_on_has_the_same_bits(tmp_path, monkeypatch, capsys, stop, more, num_steps):

@@ -17,7 +17,7 @@ from emgs_jax.mapping.run import MappingRun
 from emgs_jax.report.metrics import score_back_end
 from emgs_jax.report.run_files import save_progress
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("smoke")]
 MAX_DISTANCE, MAX_TURN = 0.05, 2.0  # the bar, where the prior errs; here it is exact
 
 
@@ -60,7 +60,7 @@ def test_a_camera_that_was_carried_off_comes_back():
 NOWHERE = (NEVER_FOUND, "graph.min_violation=1e9", "graph.relocalization.max_patience=4")
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_the_map_goes_on_where_the_prior_leads_when_the_camera_is_found_nowhere():
     """And it is right relative to the frame where it began anew, as the prior is; the frames before stay."""
     frames, cut = walk((*THERE[:5], *range(1, 17, 2))), 5
@@ -81,7 +81,7 @@ def test_the_map_goes_on_where_the_prior_leads_when_the_camera_is_found_nowhere(
     assert [node.is_placed for node in run.back_end.nodes] == [True] * cut + [False] * 3 + [True] * 5
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_nothing_begins_anew_where_nothing_leads():
     """The prior knows nothing of the frames before: where these are relative to the map is not known."""
     frames = walk((*THERE[:5], *range(1, 17, 2)))
@@ -90,7 +90,7 @@ def test_nothing_begins_anew_where_nothing_leads():
     assert "restarted" not in {record.location for record in run.records}
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_a_run_that_is_stopped_after_it_came_back_has_the_same_bits(tmp_path):
     frames, patience = walk((*THERE, *BACK)), config().graph.relocalization.patience
     keep = lambda: Keeper(tmp_path / "checkpoint.npz", CheckpointConfig(every=1000), {})  # noqa: E731
@@ -120,7 +120,7 @@ def assert_only_located(run: MappingRun, folder) -> None:
     assert len(run.back_end.poses) == len(THERE) and {record.new for record in run.records} <= {0, None}
 
 
-@pytest.mark.parametrize(("cut", "back"), [(4, 6), pytest.param(0, 1, marks=pytest.mark.long)])
+@pytest.mark.parametrize(("cut", "back"), [(4, 6), pytest.param(0, 1, marks=pytest.mark.weekly)])
 def test_a_prior_that_goes_on_in_a_frame_of_its_own_is_located_in_a_saved_map_that_stays_as_it_is(folder, cut, back):
     """Symptom: every frame of it was refused, because it had no pose in the world from before."""
     frames = walk((*BACK, 17, 19, 18))
@@ -131,7 +131,7 @@ def test_a_prior_that_goes_on_in_a_frame_of_its_own_is_located_in_a_saved_map_th
     assert_only_located(run, folder)
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_frames_are_located_in_a_saved_map_and_it_stays_as_it_is(folder):
     frames = walk(BACK)
     run = mapped(frames, prior_of(frames, "prior.seed=7"), loaded(folder, "localize"))
@@ -168,7 +168,7 @@ def test_a_run_goes_on_in_a_saved_map_and_can_be_saved_itself(folder, tmp_path):
     assert_same(jax.device_get(again.map), jax.device_get(run.map))
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_a_run_in_a_saved_map_that_is_stopped_has_the_same_bits(folder, tmp_path):
     frames = walk(BACK)
     prior = prior_of(frames)

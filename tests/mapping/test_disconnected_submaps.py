@@ -23,6 +23,8 @@ from emgs_jax.mapping.run import MappingRun
 from emgs_jax.report.metrics import describe, score_back_end
 from emgs_jax.report.run_files import save_progress
 
+pytestmark = pytest.mark.xdist_group("smoke")
+
 # Frames of the path. The last part begins where it sees the first, and walks on to where it sees the second.
 PARTS = (0, 2, 4, 6, 8), (60, 58, 56, 54, 52), (4, 2, 0, 78, 75, 72, 69, 66, 63, 60, 57)
 UNITS = (1.0, 1.25, 0.8)  # of the parts: what the prior gives there as that is a metre
@@ -83,7 +85,7 @@ def surface(frame: Frame) -> np.ndarray:
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("words", "stop"),
-    [((), 7), *(pytest.param(*case, marks=pytest.mark.long) for case in (((), 13), ((NEVER_FOUND,), 12)))],
+    [((), 7), *(pytest.param(*case, marks=pytest.mark.weekly) for case in (((), 13), ((NEVER_FOUND,), 12)))],
 )
 def test_a_run_that_is_stopped_in_a_part_or_after_it_was_joined_has_the_same_bits(tmp_path, words, stop):
     keep = lambda: Keeper(tmp_path / "checkpoint.npz", CheckpointConfig(every=1000), {})  # noqa: E731
@@ -94,7 +96,7 @@ def test_a_run_that_is_stopped_in_a_part_or_after_it_was_joined_has_the_same_bit
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("num_before", [4, pytest.param(9, marks=pytest.mark.long)])
+@pytest.mark.parametrize("num_before", [4, pytest.param(9, marks=pytest.mark.weekly)])
 def test_of_parts_that_never_meet_the_one_with_most_placed_frames_is_the_map(tmp_path, num_before):
     numbers = (*range(0, 2 * num_before, 2), *range(26, 14, -2))
     (tmp_path / "frames.jsonl").write_text(

@@ -17,6 +17,8 @@ from emgs_jax.gaussian_map import confirmed
 from emgs_jax.mapping.records import HIDDEN
 from emgs_jax.report.moving import moving_mask
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
+
 NUM_FRAMES, HIDING = 20, range(8, 11)
 
 

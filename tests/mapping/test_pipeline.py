@@ -27,6 +27,8 @@ from emgs_jax.report.gathering import RawPrior
 from emgs_jax.report.metrics import new_scorer, score_map, score_prior
 from emgs_jax.report.run_files import save_outputs
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 
 def same_bits(tree, other) -> bool:
     pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
@@ -70,8 +72,7 @@ def test_each_frame_is_read_once_just_before_it_is_needed_and_kept_only_while_a_
     assert set(frames.reads) == set(range(20)) and set(frames.reads.values()) == {1}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("window", [WINDOW_SIZE, 1])
+@pytest.mark.parametrize("window", [WINDOW_SIZE, pytest.param(1, marks=pytest.mark.slow)])
 def test_every_frame_has_one_record_with_its_true_pose_where_the_prior_is_exact(window):
     run, _ = exact() if window == WINDOW_SIZE else map_tiny(dataset(), EditedPrior(), f"slam.window_size={window}")
     assert [record.index for record in run.records] == list(range(NUM_FRAMES))
@@ -84,7 +85,6 @@ def test_every_frame_has_one_record_with_its_true_pose_where_the_prior_is_exact(
             np.testing.assert_allclose(record.newest_pose[:3, 3], following[:3, 3], atol=1e-3)
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize(
     "damages",
     [
@@ -111,7 +111,6 @@ def test_predictions_without_a_valid_point_or_pose_mark_their_frames_and_leave_t
     assert np.isfinite(np.asarray(gaussians.means)[np.asarray(gaussians.valid)]).all()
 
 
-@pytest.mark.slow
 @pytest.mark.parametrize("damaged", ["points", "T_anchor_view"])
 def test_a_bad_view_in_the_first_window_is_not_tracked_and_the_others_are(damaged):
     def edit(prediction):
@@ -140,8 +139,7 @@ def test_a_view_without_a_pose_cannot_be_merged():
         map_tiny(dataset(), EditedPrior(edit), "slam.initialization=merged")
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("num_empty", [pytest.param(1, marks=pytest.mark.long), WINDOW_SIZE + 1])
+@pytest.mark.parametrize("num_empty", [pytest.param(1, marks=pytest.mark.weekly), WINDOW_SIZE + 1])
 def test_the_map_starts_at_the_first_frame_with_a_point_and_those_before_are_lost(num_empty):
     """All later frames were degraded, the map stayed empty and nothing said so."""
 
@@ -165,8 +163,9 @@ def test_a_prior_without_any_point_is_an_error_and_not_a_run_that_never_maps():
         map_tiny(dataset(), EditedPrior(lambda prediction: replace(prediction, mask=prediction.mask & False)))
 
 
-def test_gaussians_that_are_larger_than_the_image_are_refused_by_their_key():
+def test_gaussians_that_are_larger_than_the_image_are_refused_by_their_key(monkeypatch):
     """A map without a Gaussian was said to be of a prior without a point."""
+    monkeypatch.setattr(pipeline, "prepare_step", lambda *_: None)  # of a step, which there is not
     with pytest.raises(ValueError, match=r"of \d{3,} valid points .*slam\.fit\.points_per_gaussian=1000000"):
         map_tiny(dataset(), EditedPrior(), "slam.fit.points_per_gaussian=1000000")
 
@@ -178,7 +177,6 @@ def test_a_sequence_without_frames_is_refused():
         list(window_inputs(empty, Echo(), hydra.utils.instantiate(compose().slam), Clock()))
 
 
-@pytest.mark.slow
 def test_the_merged_initialization_makes_the_map_from_the_whole_window(monkeypatch):
     """Only the first window: `initialization` is static, so a step would be compiled anew."""
     monkeypatch.setattr(pipeline, "prepare_step", lambda *_: None)  # of a step, which there is not
@@ -190,7 +188,6 @@ def test_the_merged_initialization_makes_the_map_from_the_whole_window(monkeypat
     assert len(maps) == WINDOW_SIZE and maps[0].gaussians.valid.sum() == run.records[-1].num_gaussians > 100
 
 
-@pytest.mark.slow
 def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     run, _ = exact()
     blind = replace(run, records=tuple(replace(record, true_pose=None) for record in run.records))
@@ -207,7 +204,6 @@ def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     assert dense.rendering == {}
 
 
-@pytest.mark.slow
 def test_the_densified_cloud_of_an_exact_run_lies_on_the_true_surfaces():
     """Within the size of a Gaussian: 8 points of about 3 cm spacing."""
     run, _ = exact()
@@ -218,7 +214,6 @@ def test_the_densified_cloud_of_an_exact_run_lies_on_the_true_surfaces():
     assert np.median(distance) < 0.03
 
 
-@pytest.mark.slow
 def test_the_map_does_not_start_at_the_origin_but_at_the_first_true_pose_and_at_the_identity_without_one():
     class Blind(ReadableFrames):
         def __getitem__(self, index):

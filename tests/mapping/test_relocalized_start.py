@@ -43,6 +43,8 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.slam import SlamState
 
+pytestmark = pytest.mark.slow
+
 load_config = cache(emgs_jax.load_config)  # nobody changes what it gives
 localized = eqx.filter_jit(localize_coarse)
 PLACE = matrix((10, -70, 20), (3.0, -2.0, 1.0))

@@ -30,6 +30,8 @@ from emgs_jax.report.run_splats import polish, target_of
 from experiments.polish import polish_run
 from experiments.run import run
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
+
 pytest.importorskip("optax", reason="the extra of emgs polish: pip install -e .[polish]")
 CAMERA = Camera([20.0, 23.0], [14.5, 12.25], 32, 24)
 POSES = np.stack([np.eye(4)] * 2)

@@ -67,7 +67,7 @@ def same(nodes: Nodes, others: Nodes) -> bool:
 
 
 @needs_graphs
-@pytest.mark.long  # thousands of nodes
+@pytest.mark.weekly  # thousands of nodes
 @pytest.mark.parametrize("start", ["current", "chordal"])
 @pytest.mark.parametrize(("name", "optimum"), [("sphere2500", 675.7010), ("parking-garage", 0.6342)])
 def test_known_optima_are_reached(name, optimum, start):

@@ -12,7 +12,6 @@ from emgs_jax.registration.icp import icp
 from emgs_jax.registration.noise import NUM_CELLS
 from emgs_jax.registration.problem import CoarseStart
 
-pytestmark = pytest.mark.slow  # the solver compiles for 10 s; the quick subset has test_localization
 RESIDUALS = {"colored": 0, "distribution": 1, "colored+distribution": 2, "colored+ray": 3}
 NOISE = 0.02, 0.01  # of the coarse position, m, and of depths, a fraction, and the coarse rotation, rad
 STARTS = [

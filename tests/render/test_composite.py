@@ -12,8 +12,6 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.render.composite import render, splat_depth
 from emgs_jax.render.project import Splats
 
-pytestmark = pytest.mark.slow  # many small executables: most of the time is compilation
-
 draw = sc.on_host(render)
 COUNT = 24  # rows of every map, which makes one program for a size of tiles
 T = sc.pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))

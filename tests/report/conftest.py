@@ -1,4 +1,4 @@
-"""One Chromium for all pages: the files that use it are one group of tests/schedule.py, so that they share it."""
+"""One Chromium for all pages: the files that use it are one xdist_group, so that they share it."""
 
 import pytest
 from browser import MISSING, browser

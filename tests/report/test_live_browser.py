@@ -16,6 +16,8 @@ import experiments.run
 from emgs_jax.mapping.pipeline import map_frames
 from emgs_jax.report import live
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 LISTENS = "0A"  # in /proc/net/tcp
 LOOPBACK = "0100007F"  # 127.0.0.1 there
 

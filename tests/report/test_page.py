@@ -28,6 +28,8 @@ from emgs_jax.report.provenance import is_metric
 from emgs_jax.report.splats import read_splats, splats_for_page
 from experiments.report import report
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):

@@ -23,6 +23,8 @@ from emgs_jax.report.finished_run import read_run, render_config
 from emgs_jax.report.layers import closing_covariances
 from emgs_jax.report.page import write_report
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
+
 BACKGROUND = np.array([0.086, 0.098, 0.118])  # main.js
 PIXELS = """
 const [row, width, height, focal, center] = arguments, { splats, arrays } = report, { gl, canvas } = splats;

@@ -29,6 +29,8 @@ from emgs_jax.report.query_pictures import MAX_LEGEND, drawn, frame_view, legend
 from emgs_jax.report.vocabulary import vocabulary
 from experiments.query import asked, given_views, named_views, query, rivals
 
+pytestmark = pytest.mark.slow
+
 FILES = {"query.json", "query.png", "semantic.npz", "semantic.ply", "features.png", "labels"}
 
 

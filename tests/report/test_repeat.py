@@ -9,6 +9,8 @@ from omegaconf import OmegaConf
 from emgs_jax.config.configure import compose
 from emgs_jax.report.repeat import check_targets, repeat
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def composed(*words):

@@ -25,6 +25,8 @@ from emgs_jax.report.sweeps import picture_path
 from emgs_jax.report.tables import average
 from experiments.together import shared_settings
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
+
 ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_5cm_percent"
 COMMAND = "emgs evaluate suite=smoke"
 

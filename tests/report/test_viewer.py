@@ -21,6 +21,8 @@ from emgs_jax.report.viewer import HOST, Viewer
 from emgs_jax.report.viewer_answers import ask, find_words, highlighted, picked
 from emgs_jax.report.viewer_scene import field_of_view, shown
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
+
 NAMES = ("wall", "sofa", "sofa table", "Chair")
 
 

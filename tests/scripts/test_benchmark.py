@@ -36,7 +36,7 @@ def test_what_cannot_be_timed_is_refused(tmp_path):
         benchmark_config("benchmark.turns=3")
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_both_registrations_find_the_pose_of_exact_views():
     config = benchmark_config("prior.level=0", "slam.fit.points_per_gaussian=264", "dataset.num_frames=100")
     for timing in time_icp(load(config), (0.08, 0.04), 1):  # starts 8 cm and 2.3 degrees away
@@ -44,7 +44,7 @@ def test_both_registrations_find_the_pose_of_exact_views():
         assert timing.facts["rotation_error_deg"][0] < 0.6, timing.name
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_the_tables_hold_every_part(tmp_path):
     config = benchmark_config("benchmark.num_settings=[2]", "parts=[stages,sweep]")
     timings = experiments.benchmark.benchmark(config, tmp_path)

@@ -40,6 +40,8 @@ from experiments.console import speak_on
 from experiments.evaluate import delegated
 from experiments.interrupt import clear_interrupt
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.mark.parametrize(
     ("overrides", "message"),

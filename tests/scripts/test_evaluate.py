@@ -23,6 +23,8 @@ from emgs_jax.report.provenance import RESULT_FORMAT, git_now, write_metrics
 from emgs_jax.report.results import METRICS_FILE
 from experiments.command import clear_errors
 
+pytestmark = pytest.mark.slow
+
 THIS_CODE = {"git": git_now(), "versions": {"emgs_jax": importlib.metadata.version("emgs_jax")}}
 
 
@@ -256,7 +258,7 @@ def test_the_exit_status_says_that_a_job_failed(tmp_path):
     assert "Traceback" not in done.stderr
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 @pytest.mark.parametrize("launcher", ["basic", "joblib", "submitit_local"])
 def test_shards_run_on_the_launchers_of_hydra(tmp_path, launcher):
     """One shard fails: the other one's result is there, and the command says what is wrong."""

@@ -14,6 +14,8 @@ from emgs_jax.prior.simulated.prior import Simulated
 from experiments.predict import predict
 from experiments.run import run
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 
 def record(folder: Path, *overrides: str) -> Path:
     return predict(compose(f"out={folder}", *overrides, name="predict"))

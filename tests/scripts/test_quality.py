@@ -6,6 +6,8 @@ from tiny_run import compose
 
 from experiments.run import run
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 ROOM = ("dataset.stop=20", "prior.level=1")  # long enough a path for the alignment; the shapes are those of tiny_run
 
 BOUNDS = {  # what seed 0 comes to, and a third more, which is what rounding may move
@@ -16,7 +18,7 @@ BOUNDS = {  # what seed 0 comes to, and a third more, which is what rounding may
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("seeds", [(0,), pytest.param((0, 1, 2, 3), marks=pytest.mark.long)], ids=str)
+@pytest.mark.parametrize("seeds", [(0,), pytest.param((0, 1, 2, 3), marks=pytest.mark.weekly)], ids=str)
 def test_a_map_from_noisy_predictions_is_more_accurate_than_these_and_within_its_bounds(tmp_path, seeds):
     """Means over seeds, which are fixed; of one seed the bounds are those of that draw.
 

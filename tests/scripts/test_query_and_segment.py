@@ -19,7 +19,7 @@ from experiments.query import query
 from experiments.report import report
 from experiments.segment import segment
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
 
 
 def true_points(name: str) -> np.ndarray:

@@ -21,6 +21,8 @@ from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.io.trajectory import load_trajectory_tum
 from experiments.command import clear_errors
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 FILES = {"trajectory.txt", "map.npz", "map.ply", "points.ply", "mesh.ply", "frames.jsonl", "overview.png", "text.npz"}
 FILES |= {"report.html"}
 ERRORS = [f"{kind}_{size}cm_percent" for size in (20, 5) for kind in ("f1", "precision", "recall")]
@@ -58,7 +60,6 @@ def read_log(folder: Path) -> list[dict]:
     return [json.loads(line) for line in (folder / "frames.jsonl").read_text().splitlines()]
 
 
-@pytest.mark.slow
 def test_an_exact_prior_is_not_harmed_and_metrics_json_has_exactly_the_promised_keys(exact_run):
     metrics = exact_run[1]
     assert metrics["trajectory/ate_se3_m"] <= 0.01
@@ -68,7 +69,6 @@ def test_an_exact_prior_is_not_harmed_and_metrics_json_has_exactly_the_promised_
     assert metrics["provenance"]["simulated"] is True and metrics["provenance"]["config"]["prior"]["level"] == 0
 
 
-@pytest.mark.slow
 def test_the_labels_of_the_points_are_the_true_ones_where_prior_and_features_are_exact(exact_run):
     """But for the borders of objects, where a Gaussian is as large as the parts."""
     folder, metrics = exact_run
@@ -115,7 +115,6 @@ def test_the_command_writes_the_same_bytes_again_and_baselines_stand_beside_ours
     assert {key: metrics[key] for key in same} == {key: exact_run[1][key] for key in same}
 
 
-@pytest.mark.slow
 def test_a_back_end_moves_nothing_that_is_exact_and_writes_what_it_measured(tmp_path, exact_run):
     metrics = experiments.run.run(compose("prior.level=0", "graph=default"), tmp_path)
     assert {path.name for path in tmp_path.iterdir()} >= FILES | {"trajectory_online.txt", "graph.g2o", "loops.json"}
@@ -137,7 +136,6 @@ def test_a_run_does_not_write_over_the_map_that_it_begins_with(tmp_path):
         experiments.run.run(compose(f"map={tmp_path}/../{tmp_path.name}"), tmp_path)
 
 
-@pytest.mark.slow
 def test_the_phases_account_for_the_time(exact_run):
     metrics = exact_run[1]
     parts = sum(metrics[f"time/{name}_seconds"] for name in PHASES if name not in ("compile", "total"))
@@ -145,7 +143,6 @@ def test_the_phases_account_for_the_time(exact_run):
     assert 0 < metrics["time/seconds_per_frame"] < metrics["time/map_seconds"]
 
 
-@pytest.mark.slow
 def test_every_file_is_there_and_the_trajectory_has_every_frame_at_its_time(exact_run):
     folder, metrics = exact_run
     assert {path.name for path in folder.iterdir()} == FILES | {"metrics.json"}
@@ -159,7 +156,6 @@ def test_every_file_is_there_and_the_trajectory_has_every_frame_at_its_time(exac
     assert num_all - num_confirmed == metrics["map/num_tentative"] > 0  # what only the last frame has seen
 
 
-@pytest.mark.slow
 def test_an_interrupted_run_leaves_what_it_has(tmp_path, monkeypatch, exact_run):
     def interrupt(prediction):
         if prediction.window.inference == 2:
@@ -183,7 +179,6 @@ def test_an_interrupted_run_leaves_what_it_has(tmp_path, monkeypatch, exact_run)
     assert int(map.gaussians.valid.sum()) == records[-1]["num_gaussians"]
 
 
-@pytest.mark.slow
 def test_a_bad_frame_is_left_out_and_listed_or_ends_the_run(tmp_path, monkeypatch):
     read = Synthetic.__getitem__
 

@@ -16,6 +16,8 @@ from emgs_jax.report.results import read_estimates
 from emgs_jax.report.tables import average, full_table
 from experiments.score import coverage, score
 
+pytestmark = pytest.mark.slow
+
 SIMILARITY = Sim3(0.4, Rotation.from_rotvec([0.3, -1.2, 0.5]).as_matrix(), np.array([3.0, -1.0, 7.0]))
 
 

@@ -15,6 +15,8 @@ from emgs_jax.config import configure
 from emgs_jax.config.configure import groups
 from experiments.grid import notes, read_axes, variants
 
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
+
 AXES = "axes={slam.em.max_mahalanobis_sq:[1.0,9.0],slam.em.average.gain:[count,ema_printed]}"
 COMPARED = ("trajectory/", "reconstruction", "raw_prior/", "map/", "frames/")
 
@@ -38,7 +40,7 @@ def assert_same_metrics(row: dict, metrics: dict, rtol: float) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("number", [1, *(pytest.param(number, marks=pytest.mark.long) for number in (0, 2, 3))])
+@pytest.mark.parametrize("number", [1, *(pytest.param(number, marks=pytest.mark.weekly) for number in (0, 2, 3))])
 def test_every_setting_has_the_metrics_of_a_run_with_its_values(swept, tmp_path, number):
     row = swept[1][number]
     values = [f"{name}={row[name]}" for name in ("slam.em.max_mahalanobis_sq", "slam.em.average.gain")]

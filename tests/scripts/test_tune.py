@@ -16,6 +16,8 @@ from emgs_jax.config.configure import compose
 from experiments.command import check_arguments
 from experiments.search import ask, front, open_study, own_setting, read_objectives, read_space
 
+pytestmark = pytest.mark.slow
+
 optuna = pytest.importorskip("optuna")
 GATE, GAP = "slam.em.max_mahalanobis_sq", "slam.em.max_log_gap"
 ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_5cm_percent"

@@ -8,7 +8,7 @@ from experiments.export import export_run
 from experiments.query import query
 from experiments.segment import segment
 
-pytestmark = pytest.mark.long
+pytestmark = [pytest.mark.weekly, pytest.mark.xdist_group("smoke")]
 
 # Any two views that share a place are a loop here, and each is worth a closure, so that ten frames have one.
 EAGER = (

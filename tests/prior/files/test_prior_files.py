@@ -18,6 +18,8 @@ from emgs_jax.prior.files.naming import rows_of
 from emgs_jax.prior.files.prior import Files, read_predictions
 from emgs_jax.prior.files.view import Camera, View, at_frame, whole_image
 
+pytestmark = pytest.mark.xdist_group("tiny")
+
 SIZE = (48, 64)
 UNKNOWN = "how sure the poses are is not known (prior.pose_std)"
 

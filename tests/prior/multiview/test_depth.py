@@ -9,6 +9,8 @@ from stereo_scene import depth_config, painted, small_camera, sources
 
 from emgs_jax.prior.multiview.depth import _median, _spread, estimate_depth
 
+pytestmark = pytest.mark.slow
+
 INSIDE = np.s_[8:-8, 8:-8]
 jitted_depth = eqx.filter_jit(estimate_depth)
 

@@ -8,6 +8,8 @@ from stereo_scene import AROUND, depth_config, matrix, painted, small_camera, so
 
 from emgs_jax.prior.multiview.plane_sweep import census, inverse_depths, sweep
 
+pytestmark = pytest.mark.slow
+
 jitted_sweep = eqx.filter_jit(sweep)
 PLANES = inverse_depths(jnp.asarray(1.2), jnp.asarray(5.0), depth_config().sweep)
 

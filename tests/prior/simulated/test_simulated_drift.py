@@ -14,6 +14,8 @@ from emgs_jax.prior.base import Window, windows
 from emgs_jax.prior.simulated.noise import random_walk
 from emgs_jax.prior.simulated.prior import Simulated
 
+pytestmark = pytest.mark.slow
+
 
 def window_errors(step, inference=9, version=2, level=1.0, seeds=SEEDS):
     """(v, ω) of the middle camera, frame 6, of each seed (n, 6), in metres and radians, without the scale."""
