@@ -57,7 +57,6 @@ SLOW = {
     "back_end/test_back_end.py",
     "config/test_values.py",
     "device/test_compilation.py",
-    "device/test_executables.py",
     "mapping/test_relocalized_start.py",
     *(f"scripts/{name}.py" for name in ("test_command_line", "test_evaluate", "test_score", "test_sweep_script")),
     "scripts/test_tune.py",
