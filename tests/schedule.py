@@ -19,7 +19,7 @@ GROUPS = {
         "scripts/test_predict.py",
         "prior/files/test_prior_files.py",
         "scripts/test_quality.py",
-        "test_soak.py",
+        "mapping/test_long_walk.py",
         "test_front_door.py",
         "test_notebooks.py",
         "report/test_live_browser.py",
@@ -64,7 +64,6 @@ SLOW = {
     "test_advice.py",
     "test_existence.py",
     "test_front_door.py",
-    "test_mutants.py",
     "test_splitting.py",
 }
 _PLACES = {name: (group, place) for group, names in GROUPS.items() for place, name in enumerate(names)}
