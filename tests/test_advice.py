@@ -849,17 +849,10 @@ OF_NETWORKS = [
         lambda root, said: put(WEIGHTS, f'{{"encoder_config": {{"encoder_str": "dinov2", {said[1]}}}}}')(root, said),
     ),
     (gone(f"hub/{DINOV2_CLONE}/hubconf.py"), "into that folder once"),
-    ({"model": "vgg"}, r"prior.model must be one of (\w+), ", {"model": "{1}"}),
     ({"resolution": "[50,50]"}, r"multiples of (14), or (null)", {"resolution": "[28,{1}]"}, {"resolution": "'{2}'"}),
     ({"resolution": "[518]"}, "must be .width, height. in multiples of 14", {"resolution": "[518,392]"}),
     ({"anchor_pose": "maybe"}, r"must be (on) or (off)", {"anchor_pose": "'{1}'"}, {"anchor_pose": "'{2}'"}),
-    ({"anchor_depth_m": 0}, "must be above 0 m", {"anchor_depth_m": 2}),
     ({"compute.amp": "fp8"}, "must be one of bf16, fp16, (float32)", {"compute.amp": "{1}"}),
-    (
-        {"model": "vggt", "checkpoint": "weights"},
-        r"is for prior.model=(\w+)",
-        *({"model": "{1}"}, {"checkpoint": "'null'"}),
-    ),
 ]
 
 
