@@ -19,8 +19,6 @@ from emgs_jax.slam import Overflow, StepInfo, init_state, step
 
 FRAME = 3
 pytestmark = pytest.mark.xdist_group("small")
-# With executables that are kept, as runs have them: those that test_growth.py compiled.
-init_state, step = (calling(call)(function) for function in (slam.init_state, slam.step))
 # An exact chain, lenient checks: the room is coarse at this resolution.
 LENIENT = {"localization.max_residual": 1.0, "localization.max_pose_std": np.inf}
 
