@@ -55,15 +55,15 @@ class ExistenceConfig(eqx.Module):
     birth: Float[Array, "*b"] = traced(low=-1e6)
     hit: Float[Array, "*b"] = traced(low=0)
     miss: Float[Array, "*b"] = traced(low=0)
-    max_log_odds: Float[Array, "*b"] = traced(low=0)
     refuted: Float[Array, "*b"] = traced(low=-math.inf)
-    num_std: Float[Array, "*b"] = traced(low=0)
-    min_cos: Float[Array, "*b"] = traced(low=-1, high=1)
-    num_neighbours: int = static(low=1, high=256)
     max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
     max_layer_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
     feature: Float[Array, "*b"] = choice("medoid", "accumulated")
+    max_log_odds: Float[Array, "*b"] = traced(4.0, low=0)
+    num_std: Float[Array, "*b"] = traced(3.0, low=0)
+    min_cos: Float[Array, "*b"] = traced(0.2, low=-1, high=1)
+    num_neighbours: int = static(5, low=1, high=256)
+    min_normal_cos: Float[Array, "*b"] = traced(0.9, low=-math.inf, high=1)
 
 
 class Look(NamedTuple):

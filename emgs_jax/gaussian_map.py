@@ -65,10 +65,10 @@ class SubmapConfig(eqx.Module):
         submap_capacity: rows of a submap at the start; likewise.
     """
 
-    voxel_size: Float[Array, "*b"] = traced(low=1e-6, high=1000)
-    margin: Float[Array, "*b"] = traced(low=0, high=1000)
-    map_capacity: int = static(low=1, high=2**26)
-    submap_capacity: int = static(low=1, high=2**26)
+    voxel_size: Float[Array, "*b"] = traced(0.1, low=1e-6, high=1000)
+    margin: Float[Array, "*b"] = traced(0.1, low=0, high=1000)
+    map_capacity: int = static(32768, low=1, high=2**26)
+    submap_capacity: int = static(8192, low=1, high=2**26)
 
 
 def empty_map(capacity: int, num_features: int) -> GaussianMap:

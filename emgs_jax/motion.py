@@ -31,10 +31,10 @@ class MotionConfig(eqx.Module):
     """
 
     num_looks: int = static(low=0, high=64)
-    hit: Float[Array, "*b"] = traced(low=0)
-    miss: Float[Array, "*b"] = traced(low=0)
-    prior: Float[Array, "*b"] = traced(low=-math.inf)
-    radius: int = static(low=0, high=16)
+    hit: Float[Array, "*b"] = traced(2.0, low=0)
+    miss: Float[Array, "*b"] = traced(4.0, low=0)
+    prior: Float[Array, "*b"] = traced(4.0, low=-math.inf)
+    radius: int = static(1, low=0, high=16)
 
 
 class Looks(eqx.Module):

@@ -11,7 +11,7 @@ from emgs_jax.back_end.saved_map import load_saved_map
 from emgs_jax.back_end.state import BackEndConfig
 from emgs_jax.config.configure import build, build_dataset, build_prior, compose, graph_config, message_of
 from emgs_jax.device.clock import Clock
-from emgs_jax.device.executables import compiling
+from emgs_jax.device.compilation import compiling
 from emgs_jax.device.settings import use_compilation_cache
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.bar import Bar

@@ -28,11 +28,11 @@ class SplittingConfig(eqx.Module):
     """
 
     max_splits: int = static(low=0, high=2**20)
-    min_points: Float[Array, "*b"] = traced(low=0)
-    color_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
-    num_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
     min_std: Float[Array, "*b"] = traced(low=0, high=1000)
+    min_points: Float[Array, "*b"] = traced(4.0, low=0)
+    color_std: Float[Array, "*b"] = traced(0.1, low=0, high=math.inf)
+    min_normal_cos: Float[Array, "*b"] = traced(0.9, low=-math.inf, high=1)
+    num_std: Float[Array, "*b"] = traced(2.0, low=0, high=math.inf)
 
 
 def is_too_coarse(

@@ -27,8 +27,8 @@ class ExtrapolationConfig(eqx.Module):
     """
 
     width: Float[Array, "*b"] = traced(low=0, high=10)
-    max_error: Float[Array, "*b"] = traced(low=0, high=100)
-    min_cos: Float[Array, "*b"] = traced(low=0, high=1)
+    max_error: Float[Array, "*b"] = traced(0.3, low=0, high=100)
+    min_cos: Float[Array, "*b"] = traced(0.3, low=0, high=1)
 
 
 def depth_error(

@@ -24,12 +24,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from emgs_jax.config.configure import CONF, compose, first_of_sweep, message_of
 from emgs_jax.config.overrides import KEY, quoted, readable
+from emgs_jax.config.values import check_values
 from emgs_jax.device.settings import check_platforms, leave_memory_to_torch, use_compilation_cache
 from emgs_jax.io.files import check_writable, owned
 
 from .console import Console, speak_on
 from .interrupt import clear_interrupt
-from .keys import check_keys
+from .keys import KEYS
 
 RUN = "config"  # conf/config.yaml, whose help lists every choice, by Hydra
 # Libraries that log at INFO which accelerators and threads are not there. A level of the logger "jax" that is set
@@ -51,7 +52,7 @@ def command(
                     logging.getLogger(library).setLevel(logging.WARNING)
             with kept_words(HydraConfig.get().job_logging), clear_errors(), nothing_left():
                 check_missing(name, config)
-                check_keys(name, config)
+                check_values(config, cls=KEYS.get(name))
                 check_out(config)
                 leave_memory_to_torch(config)
                 check_platforms()
@@ -62,7 +63,7 @@ def command(
 
         def main() -> None:
             speak_on()
-            if name != RUN and {"-h", "--help"} & {*sys.argv[1:]}:
+            if {"-h", "--help"} & {*sys.argv[1:]}:
                 print(help_of(name))
                 return
             with clear_interrupt():
@@ -114,6 +115,8 @@ def log_of(logging: DictConfig) -> Path | None:
 def help_of(name: str) -> str:
     """Return the help in conf/`name`.yaml: its first comment, and its own choices and keys as they stand there."""
     text = (CONF / f"{name}.yaml").read_text(encoding="utf-8")
+    if name == RUN:  # which says what matters of its many keys
+        return OmegaConf.create(text).hydra.help.template
     head, text = re.sub(r"^hydra:\n(?:(?:  .*)?\n)*", "", text, flags=re.MULTILINE).split("defaults:\n")
     own = re.sub(r"^  - (?!\w+: ).*\n", "", text, flags=re.MULTILINE)  # neither files nor what Hydra is told
     choices = re.sub(r"^  - ", "", own, flags=re.MULTILINE)

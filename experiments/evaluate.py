@@ -109,6 +109,8 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
     if settings["write_gate"]:
         check_writable(Path(settings["write_gate"]).parent, f"write_gate={settings['write_gate']}")
     jobs = list(plan(settings))
+    if not jobs:
+        raise ValueError("there is nothing to evaluate: give one seed or more, seeds=[0]")
     read_estimates(out)  # results that cannot be read end the evaluation before it begins
     ours = jobs[(part - 1) * len(jobs) // whole : part * len(jobs) // whole]  # neighbours share their executables
     open_jobs = [job for job in ours if not _is_finished(job)]

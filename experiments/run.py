@@ -16,7 +16,7 @@ from emgs_jax.config.configure import baseline_configs, build, build_dataset, bu
 from emgs_jax.config.values import check_values
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
-from emgs_jax.device.executables import compiling
+from emgs_jax.device.compilation import compiling
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.bar import Bar
 from emgs_jax.io.files import FrameLog, owned

@@ -18,7 +18,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 CONTEXT = multiprocessing.get_context("forkserver")
-# What the commands import, but nothing of this package: a tree with a mutant has its own.
+# What the commands import, but nothing of this package.
 HEAVY = [
     *("jax", "jax.numpy", "jax.experimental.compilation_cache.compilation_cache", "equinox", "jaxlie", "lineax"),
     *("optimistix", "hydra", "hydra.main", "hydra.core.hydra_config", "hydra._internal.core_plugins", "omegaconf"),

@@ -654,7 +654,6 @@ OF_NETWORKS = [
     ({"resolution": "[50,50]"}, r"multiples of (14), or (null)"),
     ({"resolution": "[518]"}, "must be .width, height. in multiples of 14"),
     ({"anchor_pose": "maybe"}, r"must be (on) or (off)"),
-    ({"anchor_depth_m": 0}, "must be above 0 m"),
     ({"compute.amp": "fp8"}, "must be one of bf16, fp16, (float32)"),
 ]
 

@@ -10,7 +10,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 from tiny_run import TINY
 
-from tools.notebooks.__main__ import OUTPUTS_OF, code_digest
+from tools.notebooks import OUTPUTS_OF, code_digest
 
 pytestmark = pytest.mark.xdist_group("tiny")
 

@@ -11,18 +11,14 @@ import scene as sc
 from scene import FULL, ROOM, WHOLE, exact, noisy, noisy_prediction
 
 from emgs_jax import slam
-from emgs_jax.device.executables import call
 from emgs_jax.localization import COARSE
 from emgs_jax.mapping.capacity import advance, grow_capacities, start
 from emgs_jax.mapping.convert import opening
 from emgs_jax.observation import Prediction
-from emgs_jax.ops.executable import calling
-from emgs_jax.slam import Overflow, StepInfo
+from emgs_jax.slam import Overflow, StepInfo, init_state, step
 
 FRAME = 3
 pytestmark = pytest.mark.xdist_group("small")
-# With executables that are kept, as runs have them: those that test_growth.py compiled.
-init_state, step = (calling(call)(function) for function in (slam.init_state, slam.step))
 # An exact chain, lenient checks: the room is coarse at this resolution.
 LENIENT = {"localization.max_residual": 1.0, "localization.max_pose_std": np.inf}
 

@@ -29,30 +29,27 @@ from loop_scene import (
 from scene import FULL, THINNED, WHOLE
 from stereo_scene import structure_config
 
-from emgs_jax import slam
 from emgs_jax.back_end.factors import FrameData, NoiseConfig, loop_factor, map_factor, sequential_factor, stack_factors
 from emgs_jax.config import configure
 from emgs_jax.config.configure import build
 from emgs_jax.data.spool import Spool
-from emgs_jax.device.executables import call
 from emgs_jax.geometry import Sim3
 from emgs_jax.loop_closure.place_recognition import Database, add_keyframe
 from emgs_jax.loop_closure.relocalization import PosedKeyframes, relocalize
 from emgs_jax.loop_closure.verification import LoopMeasurement, verify
-from emgs_jax.ops.executable import calling
 from emgs_jax.polish.fit import Views, fit
 from emgs_jax.polish.seeds import Seeds
 from emgs_jax.pose_graph.deform import DeformConfig, deform
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, optimize
 from emgs_jax.render.densify import DensifyConfig, densify
+from emgs_jax.slam import SlamState, StepInfo, init_state, step
 from emgs_jax.structure.model import to_structure
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("small")]
 VIEWS, STEPS, SEED = 3, 10, 2
 COUNT = VIEWS + STEPS
 ELSEWHERE = (0.7, 0.2, -0.4), (600.0, -700.0, 400.0)  # a turn, and a kilometre: float32 has steps of .06 mm there
-init_state, step = (calling(call)(function) for function in (slam.init_state, slam.step))
 
 
 class World(NamedTuple):
@@ -85,7 +82,7 @@ class World(NamedTuple):
 USUAL = World(1.0, (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
 
 
-def mapped(world: World) -> tuple[slam.SlamState, list[slam.StepInfo]]:
+def mapped(world: World) -> tuple[SlamState, list[StepInfo]]:
     rng, config = np.random.default_rng(SEED), sc.at(sc.slam_config(*WHOLE), "localization.max_residual", 1.0)
     # The field turns rounding into other pixels at rims; its unit is tested in registration/test_depth_field.py.
     config = sc.at(config, "localization.icp.max_field", 0.0)
@@ -106,13 +103,13 @@ def mapped(world: World) -> tuple[slam.SlamState, list[slam.StepInfo]]:
     return jax.device_get(state), infos
 
 
-def paths_of(world: World, infos: list[slam.StepInfo]) -> np.ndarray:
+def paths_of(world: World, infos: list[StepInfo]) -> np.ndarray:
     """Poses of all frames in this world, (n, 4, 4)."""
     first = [world.pose(sc.path_pose(i)) for i in range(VIEWS)]
     return np.stack([sc.matrix_of(T) for T in (*first, *(info.T_world_camera for info in infos))])
 
 
-def graph_of(world: World, infos: list[slam.StepInfo]) -> PoseGraph:
+def graph_of(world: World, infos: list[StepInfo]) -> PoseGraph:
     """Of the frames, with a loop that knows where the last one is from the first that was placed."""
     poses, s = paths_of(world, infos), world.size
     scales = np.append(np.zeros(VIEWS), np.log([float(info.localization.scale) for info in infos]))

@@ -35,17 +35,17 @@ class BackEndConfig:
         deform: of the map, to follow the optimized poses.
     """
 
-    noise: NoiseConfig
-    place_recognition: PlaceRecognitionConfig
-    verification: VerificationConfig
-    consistency: ConsistencyConfig
-    prior_query: PriorQueryConfig
-    every: int = number(low=1, high=1000)
-    min_violation: float = number(low=0, high=math.inf)
-    min_frames: int = number(low=0)
-    solver: PoseGraphConfig
-    deform: DeformConfig
-    relocalization: RelocalizationConfig
+    noise: NoiseConfig = field(default_factory=NoiseConfig)
+    place_recognition: PlaceRecognitionConfig = field(default_factory=PlaceRecognitionConfig)
+    verification: VerificationConfig = field(default_factory=VerificationConfig)
+    consistency: ConsistencyConfig = field(default_factory=ConsistencyConfig)
+    prior_query: PriorQueryConfig = field(default_factory=PriorQueryConfig)
+    every: int = number(1, low=1, high=1000)
+    min_violation: float = number(18.5, low=0, high=math.inf)  # χ²₇ at 99 %
+    min_frames: int = number(10, low=0)
+    solver: PoseGraphConfig = field(default_factory=PoseGraphConfig)
+    deform: DeformConfig = field(default_factory=DeformConfig)
+    relocalization: RelocalizationConfig = field(default_factory=RelocalizationConfig)
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,7 @@ from omegaconf.errors import MissingMandatoryValue
 from tqdm import tqdm
 
 from emgs_jax.config.overrides import readable
+from emgs_jax.config.schema import register
 from emgs_jax.config.values import check_values
 from emgs_jax.data.masks import Masks
 from emgs_jax.data.readable import ReadableFrames
@@ -110,6 +111,7 @@ def compose(*overrides: str, name: str = "config") -> DictConfig:
 @contextmanager
 def _hydra() -> Iterator[None]:
     """Hydra over conf/; whatever state of it there is comes back at the end, so this works inside of its programs."""
+    register()
     before = copy.deepcopy(Singleton.get_state())
     GlobalHydra.instance().clear()
     try:
@@ -123,7 +125,7 @@ def groups() -> dict[str, list[str]]:
     """Every group of conf/ and the names of its options."""
     found: dict[str, list[str]] = {}
     for path in sorted(CONF.rglob("*.yaml")):
-        if path.parent != CONF:
+        if path.parent != CONF and not path.stem.startswith("_"):
             found.setdefault(path.parent.relative_to(CONF).as_posix(), []).append(path.stem)
     return found
 

@@ -14,7 +14,6 @@ KEY = re.compile(r"(?:\+{1,2}|~)?[A-Za-z_][\w./@:-]*=")
 # Keys whose values are names, though they may look like numbers: in any part of the settings, and by themselves.
 NAMES, WHOLE_NAMES = ("root", "sequence", "folder", "model", "trajectory"), ("map", "out")
 HOME = re.compile(r"(^|[,\[] ?)~(?=/)")  # shells leave it, zsh always, others in quotes
-OPENS = {"[": "]", "{": "}"}
 PLAIN = re.compile(r"[A-Za-z_][\w./-]*|/[\w./-]*")  # text that needs no quotes, but for these words
 WORDS = {"null", "none", "true", "false", "nan", "inf", "on", "off", "yes", "no"}
 
@@ -23,31 +22,10 @@ def readable(arguments: Sequence[str]) -> list[str]:
     """The words with every `key=value` quoted that means something else to Hydra, or nothing.
 
     A value is text where there is such a file or folder, and where the grammar has no place for its signs: spaces with
-    brackets, `=`, letters beyond ASCII. A number stays one, unless the key is that of a name: folders are numbered. A
-    list that a shell has cut at its spaces is put together, `~/` is the home.
+    brackets, `=`, letters beyond ASCII. A number stays one, unless the key is that of a name: folders are numbered.
+    `~/` is the home.
     """
-    return [_readable(word) if KEY.match(word) else word for word in joined(arguments)]
-
-
-def joined(arguments: Sequence[str]) -> list[str]:
-    """`key=[1, 2]` as one word where it came as two; what is never closed stays as it is."""
-    words: list[str] = []
-    rest = [*arguments]
-    while rest:
-        word, rest = rest[0], rest[1:]
-        if _is_open(word):
-            ends = [n for n in range(1, len(rest) + 1) if not _is_open(" ".join([word, *rest[:n]]))]
-            count = ends[0] if ends else 0
-            word, rest = " ".join([word, *rest[:count]]), rest[count:]
-        words.append(word)
-    return words
-
-
-def _is_open(word: str) -> bool:
-    """Test whether the value of an override is a list or mapping without its end."""
-    value = word[found.end() :] if (found := KEY.match(word)) else ""
-    closing = OPENS.get(value[:1])
-    return closing is not None and value.count(value[0]) > value.count(closing)
+    return [_readable(word) if KEY.match(word) else word for word in arguments]
 
 
 def parsed(word: str) -> Override | None:
@@ -65,9 +43,6 @@ def _readable(word: str) -> str:
     word = key + value
     found = parsed(word)
     if found is None:
-        items = value.split(",")
-        if len(items) > 1 and not _is_there(value) and all(map(_is_there, items)):  # of a multirun
-            return f"{key}{','.join(map(quoted, items))}"
         whole = f"{key}{_quoted_items(value)}" if value[:1] + value[-1:] == "[]" and not _is_there(value) else ""
         return whole if whole and parsed(whole) is not None else f"{key}{quoted(value)}"
     is_name = key[:-1].rpartition(".")[2] in NAMES or key[:-1] in WHOLE_NAMES

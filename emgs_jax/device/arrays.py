@@ -3,13 +3,12 @@
 from collections.abc import Iterable, Iterator
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
 from scipy.spatial.transform import Rotation
-
-from emgs_jax.device.executables import stored
 
 
 def on_device(tree: Any) -> Any:
@@ -17,7 +16,7 @@ def on_device(tree: Any) -> Any:
     return jax.tree.map(jax.device_put, tree)
 
 
-@stored
+@eqx.filter_jit
 def _poses(matrices: jax.Array, is_finite: jax.Array) -> jaxlie.SE3:
     return jaxlie.SE3(jnp.where(is_finite[..., None], jaxlie.SE3.from_matrix(matrices).wxyz_xyz, jnp.nan))
 

@@ -1,5 +1,6 @@
 """Settings of JAX: where executables are kept for the next process, and how much of a GPU's memory it takes."""
 
+import contextlib
 import math
 import os
 import re
@@ -7,9 +8,11 @@ import sys
 import tempfile
 from pathlib import Path
 
+from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
 MAX_BYTES = 2 * 2**30  # what was not used for longest goes first
+HALVES = "-cache", "-atime"  # ends of JAX's file names
 # Where a config says so, and where it has the words that will.
 IN_TORCH = re.compile(
     r"emgs_jax\.prior\.network\.|emgs_jax\.features\.dino\.|prior[=:] ?mapanything|features[=:] ?dinov\d_text"
@@ -48,11 +51,26 @@ def use_compilation_cache(folder: str | None = "auto") -> None:
         if not isinstance(error, OSError) or not os.access(path, os.R_OK | os.X_OK):
             return
         is_kept = False
+    if is_kept:
+        _remove_orphans(path)
     jax.config.update("jax_compilation_cache_dir", str(path))
     # To keep its bound JAX notes when a file was used; where it must not, nothing takes long enough to be kept.
     jax.config.update("jax_compilation_cache_max_size", MAX_BYTES if is_kept else -1)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0 if is_kept else math.inf)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+def _remove_orphans(folder: Path) -> None:
+    """Remove files of JAX's cache that lack their other half, as a full disk leaves them.
+
+    JAX keeps a program in KEY-cache and the time of its last use in KEY-atime. As long as one program has no time, JAX
+    keeps no other (jax 0.10.1).
+    """
+    with contextlib.suppress(OSError, Timeout), FileLock(folder / ".lockfile", timeout=10):  # JAX's own lock
+        files = {name: {path.name.removesuffix(name) for path in folder.glob(f"*{name}")} for name in HALVES}
+        for name, other in (HALVES, HALVES[::-1]):
+            for key in files[name] - files[other]:
+                (folder / f"{key}{name}").unlink(missing_ok=True)
 
 
 def leave_memory_to_torch(config: DictConfig) -> None:

@@ -42,12 +42,12 @@ class Pinhole:
 class VoxelConfig:
     """The mean of all points of each voxel; see `draw_voxels`."""
 
-    voxel_m: float = number(low=1e-6)
+    voxel_m: float = number(0.02, low=1e-6)
     # A point is drawn as the square that its voxel covers, but at most so far to each side: what lies just before the
     # camera would fill the image.
-    max_footprint_px: int = number(low=1, high=4096)
-    surface_depth: float = number(low=0)
-    min_points: int = number(low=1)
+    max_footprint_px: int = number(8, low=1, high=4096)
+    surface_depth: float = number(0.1, low=0)
+    min_points: int = number(10, low=1)
 
     def start(self, pinhole: Pinhole, unit: float) -> "Fusion":
         """Without any view; a length of the poses is `unit` metres."""
@@ -62,9 +62,9 @@ class TsdfConfig:
     surfaces nearer to each other than that disturb each other.
     """
 
-    voxel_m: float = number(low=1e-6)
-    truncation_m: float = number(low=1e-6)  # where the field ends; a few voxels, and more than the noise of the depth
-    min_views: int = number(low=1)  # that must have seen a place
+    voxel_m: float = number(0.02, low=1e-6)
+    truncation_m: float = number(0.08, low=1e-6)  # where the field ends; a few voxels, more than the noise of a depth
+    min_views: int = number(1, low=1)  # that must have seen a place
 
     def __post_init__(self) -> None:
         if self.truncation_m < self.voxel_m:

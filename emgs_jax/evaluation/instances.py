@@ -12,8 +12,8 @@ from emgs_jax.ops.ranges import number
 class InstanceConfig:
     """Clustering of a query's answers into objects (DBSCAN): those within reach of each other are one."""
 
-    reach: float = number(low=1e-6, high=1e6)  # in median distances between nearest Gaussians of the map
-    min_gaussians: int = number(low=1, high=10**6)  # within `reach` of one, itself included: DBSCAN's minPts
+    reach: float = number(3.0, low=1e-6, high=1e6)  # in median distances between nearest Gaussians of the map
+    min_gaussians: int = number(3, low=1, high=10**6)  # within `reach` of one, itself included: DBSCAN's minPts
 
 
 @dataclass(frozen=True)

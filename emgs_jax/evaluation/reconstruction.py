@@ -35,25 +35,29 @@ class EvaluationConfig:
     """The protocol of a comparison; it is written into every result. Values: conf/evaluation."""
 
     protocol: str
-    alignment: str = one_of("sim3", "se3")  # se3: without the scale
-    statistic: str = one_of("mean", "rmse")  # of the distances
-    max_distance_m: float = number(low=1e-6, high=math.inf)  # longer distances count as this long; F1 does not change
-    max_depth_m: float = number(low=1e-6, high=math.inf)  # true depth farther away is left out
-    icp_distance_m: float = number(low=0)  # ICP after the alignment takes pairs within this distance; 0 = no ICP
-    placement_icp_m: float = number(low=1e-6)  # likewise for reconstruction_icp/…, whatever the protocol does
-    icp_voxel_m: float = number(low=1e-4)  # a grid has 2^20 cells to each side of the origin
-    icp_max_steps: int = number(low=0, high=10000)
-    voxel_m: float = number(low=1e-4)
-    max_points: int | None = number(low=1, high=1e9)  # compare a random choice of so many points of each cloud
-    num_sampled: int = number(low=1, high=1e9)  # points of the estimate whose distances to the truth are taken
-    f1_thresholds_m: tuple[float, ...] = number(low=1e-9)
-    max_normal_angle_deg: float = number(low=0, high=180)
-    normal_radius_px: int = number(low=1, high=64)
-    normal_step_px: int = number(low=1, high=64)
-    max_normal_gap: float = number(low=0, high=math.inf)  # relative inverse-depth step to a tap of the normal's window
-    max_normal_residual: float = number(low=0, high=math.inf)  # likewise, distance of a tap from the fitted plane
-    min_normal_taps: int = number(low=3, high=1000)
-    label_neighbours: int = number(low=1, high=1000)  # nearest points of the map that vote for a true point's label
+    alignment: str = one_of("sim3", "se3", default="sim3")  # se3: without the scale
+    statistic: str = one_of("mean", "rmse", default="mean")  # of the distances
+    max_distance_m: float = number(
+        math.inf, low=1e-6, high=math.inf
+    )  # longer distances count as this long; F1 does not change
+    max_depth_m: float = number(math.inf, low=1e-6, high=math.inf)  # true depth farther away is left out
+    icp_distance_m: float = number(0.0, low=0)  # ICP after the alignment takes pairs within this distance; 0 = no ICP
+    placement_icp_m: float = number(0.1, low=1e-6)  # likewise for reconstruction_icp/…, whatever the protocol does
+    icp_voxel_m: float = number(0.05, low=1e-4)  # a grid has 2^20 cells to each side of the origin
+    icp_max_steps: int = number(30, low=0, high=10000)
+    voxel_m: float = number(0.01, low=1e-4)
+    max_points: int | None = number(None, low=1, high=1e9)  # compare a random choice of so many points of each cloud
+    num_sampled: int = number(1000000, low=1, high=1e9)  # points of the estimate whose distances to the truth are taken
+    f1_thresholds_m: tuple[float, ...] = number((0.2, 0.05), low=1e-9)
+    max_normal_angle_deg: float = number(30.0, low=0, high=180)
+    normal_radius_px: int = number(4, low=1, high=64)
+    normal_step_px: int = number(2, low=1, high=64)
+    max_normal_gap: float = number(
+        0.1, low=0, high=math.inf
+    )  # relative inverse-depth step to a tap of the normal's window
+    max_normal_residual: float = number(0.02, low=0, high=math.inf)  # likewise, distance of a tap from the fitted plane
+    min_normal_taps: int = number(8, low=3, high=1000)
+    label_neighbours: int = number(5, low=1, high=1000)  # nearest points of the map that vote for a true point's label
 
 
 def window_normals(points: np.ndarray, valid: np.ndarray, config: EvaluationConfig) -> np.ndarray:

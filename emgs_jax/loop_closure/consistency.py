@@ -31,12 +31,12 @@ class ConsistencyConfig:
         max_violating_queries: queries of loops with a free-space violation, in a chain of consistent loops.
     """
 
-    max_query_gap: int = number(low=0)
-    max_candidate_gap: int = number(low=0)
-    max_distance: float = number(low=0, high=math.inf)
-    max_turn_deg: float = number(low=0, high=math.inf)
-    min_others: int = number(low=0)
-    max_violating_queries: int = number(low=0)
+    max_query_gap: int = number(30, low=0)
+    max_candidate_gap: int = number(30, low=0)
+    max_distance: float = number(0.15, low=0, high=math.inf)
+    max_turn_deg: float = number(4.0, low=0, high=math.inf)
+    min_others: int = number(2, low=0)
+    max_violating_queries: int = number(1, low=0)
 
 
 def spatially_consistent(

@@ -36,19 +36,19 @@ class PlaceRecognitionConfig:
         quantile: of these similarities, which a candidate must reach.
     """
 
-    num_features: int = number(low=1)
-    min_contrast: float = number(low=0, high=1)
-    max_depth_step: float = number(low=0, high=math.inf)
-    grid: tuple[int, int] = number(low=1, high=4096)
-    num_words: int = number(low=1, high=65536)
-    max_training: int = number(low=1, high=1e8)
-    num_iterations: int = number(low=0, high=1000)
-    seed: int = number(low=0, high=2**31 - 1)
-    min_gap: int = number(low=0)
-    suppressed_gap: int = number(low=0)
-    num_candidates: int = number(low=1, high=1000)
-    num_neighbours: int = number(low=1, high=1000)
-    quantile: float = number(low=0, high=1)
+    num_features: int = number(500, low=1)
+    min_contrast: float = number(0.003, low=0, high=1)  # pale walls have no more
+    max_depth_step: float = number(0.05, low=0, high=math.inf)
+    grid: tuple[int, int] = number((80, 60), low=1, high=4096)
+    num_words: int = number(64, low=1, high=65536)
+    max_training: int = number(10000, low=1, high=1e8)
+    num_iterations: int = number(15, low=0, high=1000)
+    seed: int = number(0, low=0, high=2**31 - 1)
+    min_gap: int = number(60, low=0)
+    suppressed_gap: int = number(25, low=0)
+    num_candidates: int = number(5, low=1, high=1000)
+    num_neighbours: int = number(8, low=1, high=1000)
+    quantile: float = number(0.5, low=0, high=1)
 
 
 @dataclass(frozen=True)

@@ -35,15 +35,15 @@ class PriorQueryConfig:
         max_misfit: χ² of the two measurements of a loop, of seven degrees of freedom, beyond which it is refused.
     """
 
-    is_used: bool
-    max_queries: int = number(low=1, high=1000)
-    spacing: int = number(low=1, high=1000)
-    std: float = number(low=1e-6, high=1000)
-    std_share: float = number(low=0, high=10)
-    std_deg: float = number(low=1e-6, high=180)
-    log_ratio_std: float = number(low=1e-6, high=10)
-    min_cells: int = number(low=1)
-    max_misfit: float = number(low=0, high=math.inf)
+    is_used: bool = True
+    max_queries: int = number(3, low=1, high=1000)
+    spacing: int = number(3, low=1, high=1000)
+    std: float = number(0.03, low=1e-6, high=1000)
+    std_share: float = number(0.02, low=0, high=10)
+    std_deg: float = number(1.0, low=1e-6, high=180)
+    log_ratio_std: float = number(0.02, low=1e-6, high=10)
+    min_cells: int = number(100, low=1)
+    max_misfit: float = number(24.3, low=0, high=math.inf)  # χ²₇ at 99.9 %
 
 
 @dataclass(frozen=True)

@@ -36,15 +36,15 @@ class RelocalizationConfig:
         max_step: between the pose by the keyframe and that by the map, times the mean depth.
     """
 
-    patience: int = number(low=1)
-    max_patience: float = number(low=1, high=math.inf)
-    num_candidates: int = number(low=1, high=1000)
-    max_distance: float = number(low=0, high=math.inf)
-    max_turn_deg: float = number(low=0, high=math.inf)
-    min_inliers: int = number(low=0)
-    min_inlier_fraction: float = number(low=0, high=1)
-    max_step: float = number(low=0, high=math.inf)
-    max_step_deg: float = number(low=0, high=180)
+    patience: int = number(3, low=1)
+    max_patience: float = number(3.0, low=1, high=math.inf)
+    num_candidates: int = number(10, low=1, high=1000)
+    max_distance: float = number(0.1, low=0, high=math.inf)
+    max_turn_deg: float = number(5.0, low=0, high=math.inf)
+    min_inliers: int = number(40, low=0)
+    min_inlier_fraction: float = number(0.5, low=0, high=1)
+    max_step: float = number(0.05, low=0, high=math.inf)
+    max_step_deg: float = number(3.0, low=0, high=180)
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,7 @@
 """Relative pose of two keyframes that show the same place, with gates on the pair itself, cheap ones first."""
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import cv2
@@ -64,20 +64,20 @@ class AlignmentConfig:
         scale_std: of the prior's log-scale; the ratio of two may be 3 √2 times that. Infinite without a metric prior.
     """
 
-    max_ratio: float = number(low=0, high=1)
-    max_epipolar_error: float = number(low=0, high=1000)
-    min_matches: int = number(low=MIN_POSE)
-    min_match_share: float = number(low=0, high=1)
-    max_reprojection_error: float = number(low=0, high=1000)
-    min_pose_points: int = number(low=MIN_POSE)
-    max_pose_gap: float = number(low=0, high=math.inf)
-    max_pose_turn_deg: float = number(low=0, high=math.inf)
-    min_hull: float = number(low=0, high=1)
-    min_flatness: float = number(low=0, high=1)
-    min_extent: float = number(low=0)
-    max_depth_scatter: float = number(low=0, high=math.inf)
-    scale_std: float = number(low=0, high=math.inf)
-    refine: RefineConfig
+    max_ratio: float = number(0.85, low=0, high=1)
+    max_epipolar_error: float = number(1.5, low=0, high=1000)
+    min_matches: int = number(30, low=MIN_POSE)
+    min_match_share: float = number(0.3, low=0, high=1)
+    max_reprojection_error: float = number(2.0, low=0, high=1000)
+    min_pose_points: int = number(20, low=MIN_POSE)
+    max_pose_gap: float = number(0.1, low=0, high=math.inf)
+    max_pose_turn_deg: float = number(5.0, low=0, high=math.inf)
+    min_hull: float = number(0.1, low=0, high=1)
+    min_flatness: float = number(0.05, low=0, high=1)
+    min_extent: float = number(0.2, low=0)
+    max_depth_scatter: float = number(0.1, low=0, high=math.inf)
+    scale_std: float = number(0.03, low=0, high=math.inf)
+    refine: RefineConfig = field(default_factory=RefineConfig)
 
 
 class RefusedError(Exception):

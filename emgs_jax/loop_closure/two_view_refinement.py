@@ -32,12 +32,12 @@ class RefineConfig:
             units of a, degrees, and of the log-ratio.
     """
 
-    min_pixel_std: float = number(low=1e-6, high=1000)
-    min_depth_std: float = number(low=1e-9, high=1000)
-    correlation: float = number(low=0, high=1)
-    floor_translation: float = number(low=0)
-    floor_rotation_deg: float = number(low=0)
-    floor_log_ratio: float = number(low=0)
+    min_pixel_std: float = number(0.3, low=1e-6, high=1000)
+    min_depth_std: float = number(0.005, low=1e-9, high=1000)
+    correlation: float = number(0.05, low=0, high=1)
+    floor_translation: float = number(0.01, low=0)
+    floor_rotation_deg: float = number(0.3, low=0)
+    floor_log_ratio: float = number(0.005, low=0)
 
 
 @dataclass(frozen=True)

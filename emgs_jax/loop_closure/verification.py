@@ -6,7 +6,7 @@ consistency tells them apart, see `consistency`.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -32,13 +32,13 @@ class VerificationConfig:
         free_space_margin: share of the depth by which it must be in the way.
     """
 
-    alignment: AlignmentConfig
-    min_neighbours: int = number(low=0, high=1000)
-    max_neighbour_gap: float = number(low=0, high=math.inf)
-    max_neighbour_distance: float = number(low=0, high=math.inf)
-    max_neighbour_turn_deg: float = number(low=0, high=math.inf)
-    max_free_space_violation: float = number(low=0, high=1)
-    free_space_margin: float = number(low=0)
+    alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
+    min_neighbours: int = number(2, low=0, high=1000)
+    max_neighbour_gap: float = number(0.02, low=0, high=math.inf)
+    max_neighbour_distance: float = number(0.015, low=0, high=math.inf)
+    max_neighbour_turn_deg: float = number(3.0, low=0, high=math.inf)
+    max_free_space_violation: float = number(0.02, low=0, high=1)
+    free_space_margin: float = number(0.15, low=0)
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,6 @@ from jaxtyping import Array, Int
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.device.clock import Timer
-from emgs_jax.device.executables import call
 from emgs_jax.mapping.atlas import with_state
 from emgs_jax.mapping.capacity import advance, start
 from emgs_jax.mapping.convert import FirstWindow
@@ -30,7 +29,6 @@ from emgs_jax.mapping.tracking import lost_event, start_event, step_event
 from emgs_jax.mapping.window_input import RawView, WindowInput, window_inputs
 from emgs_jax.observation import Observation, Prediction
 from emgs_jax.ops.camera import Camera
-from emgs_jax.ops.executable import calling
 from emgs_jax.ops.pytree import Tree, stack
 from emgs_jax.prior.base import Prior
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo, init_state, step
@@ -141,7 +139,6 @@ def _item(tree: Tree, position: int) -> Tree:
     return jax.tree.map(lambda leaf: leaf[position], tree)
 
 
-@calling(call)  # which notices what is replaced
 def init_states(
     views: Observation, T_world_views: jaxlie.SE3, camera: Camera, configs: SlamConfig
 ) -> tuple[SlamState, Int[Array, "s"]]:
@@ -149,7 +146,6 @@ def init_states(
     return eqx.filter_vmap(lambda config: init_state(views, T_world_views, camera, config))(configs)
 
 
-@calling(call)
 def step_states(
     states: SlamState, prediction: Prediction, camera: Camera, configs: SlamConfig
 ) -> tuple[SlamState, StepInfo]:

@@ -4,6 +4,7 @@ import contextlib
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
+from functools import partial
 from threading import Event, Lock
 from typing import Any
 
@@ -14,8 +15,7 @@ import jaxlie
 import numpy as np
 
 from emgs_jax.device.arrays import on_device
-from emgs_jax.device.executables import call, make_all, making, outputs, ready
-from emgs_jax.device.fingerprint import fingerprint
+from emgs_jax.device.compilation import compile_all
 from emgs_jax.gaussian_map import GaussianMap, empty_map, grow, insert
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.motion import no_looks
@@ -27,13 +27,11 @@ from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.slam import Overflow, SlamConfig, SlamState, StepInfo, init_state, step
 
 _insert = eqx.filter_jit(insert)
-_init, _step = (calling(call)(function) for function in (init_state, step))  # by executables that are kept
-_prepared: set[tuple] = set()  # steps and shapes that this process has compiled
 _preparing = Lock()
 
 
 def start(
-    first: FirstWindow, camera: Camera, config: SlamConfig, init: Callable = _init
+    first: FirstWindow, camera: Camera, config: SlamConfig, init: Callable = init_state
 ) -> tuple[SlamState, SlamConfig]:
     """Make the map of the first window; return the state, and the config with the capacity that it needs.
 
@@ -82,9 +80,7 @@ def add_map(map: GaussianMap, other: GaussianMap, config: SlamConfig) -> tuple[G
 def prepare_step(
     views: Observation, camera: Camera, config: SlamConfig, is_wanted: Callable[[], bool] = lambda: True
 ) -> None:
-    """Load or compile the executables of `step` side by side, which takes as many cores as there are.
-
-    Where none are kept each is called once, with zeros; what a process has already is not called again.
+    """Compile the executables of `step` side by side, on as many cores as there are; those that are there cost little.
 
     Args:
         views: observations of the sequence, stacked, or their shapes.
@@ -95,7 +91,7 @@ def prepare_step(
 
     def note(executable: Callable, *arguments: Any) -> Any:
         calls.append((executable, arguments))
-        return _zeros(outputs(executable, *arguments))
+        return _zeros(eqx.filter_eval_shape(executable, *arguments))
 
     view = _zeros(jax.tree.map(lambda leaf: jax.ShapeDtypeStruct(leaf.shape[1:], leaf.dtype), views))
     pose, poses = (jaxlie.SE3(on_device(np.eye(1, 7, dtype=np.float32).repeat(n, 0).squeeze())) for n in (1, 3))
@@ -111,18 +107,12 @@ def prepare_step(
         is_repeat=unknown,
     )
     map = _zeros(jax.eval_shape(lambda: empty_map(config.submap.map_capacity, view.features.shape[-1])))
-    shapes = tuple(leaf.shape for leaf in jax.tree.leaves((map, view)))
-    key = fingerprint(step), jax.tree.structure((map, view, config)), shapes
+    looks = _zeros(jax.eval_shape(lambda: no_looks(view, config.motion)))
+    state = SlamState(map, view, pose, _zeros(jax.eval_shape(exact_estimate)), on_device(np.int32(0)), looks)
     with _preparing:  # one that began beside the prediction may not have ended
-        if key in _prepared:
-            return
-        looks = _zeros(jax.eval_shape(lambda: no_looks(view, config.motion)))
-        state = SlamState(map, view, pose, _zeros(jax.eval_shape(exact_estimate)), on_device(np.int32(0)), looks)
         with calling(note):
             step(state, prediction, camera, config)
-        make_all(lambda *noted: is_wanted() and _prepare(*noted), calls)
-        if is_wanted():
-            _prepared.add(key)
+        compile_all([partial(_compile, *noted) for noted in calls], is_wanted)
 
 
 @contextlib.contextmanager
@@ -148,10 +138,8 @@ def prepared_beside(camera: Camera, num_features: int, config: SlamConfig) -> It
 
 
 @full_precision  # as inside `step`: else it is another
-def _prepare(executable: Callable, arguments: tuple) -> None:
-    if ready(executable, *arguments) is None:
-        with making(executable):
-            jax.block_until_ready(executable(*arguments))
+def _compile(executable: Any, arguments: tuple) -> None:
+    executable.lower(*arguments).compile()
 
 
 def _of_map(overflow: jax.Array) -> Overflow:
@@ -167,7 +155,7 @@ def _zeros(shapes: Any) -> Any:
 
 
 def advance(
-    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig, step: Callable = _step
+    state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig, step: Callable = step
 ) -> tuple[SlamState, StepInfo, SlamConfig]:
     """Run one step; where a map or submap is full, double its capacity and repeat the frame.
 

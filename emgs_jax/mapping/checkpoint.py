@@ -43,10 +43,11 @@ class CheckpointConfig:
     """Interval between checkpoints of a run.
 
     Args:
-        every: frames; 0 = never, and a run that is stopped starts again at its first frame.
+        every: frames between checkpoints, from which the same command in the same folder resumes; 0 = none: a run that
+            is stopped starts again at its first frame.
     """
 
-    every: int = number(low=0, high=1_000_000_000)
+    every: int = number(50, low=0, high=1_000_000_000)
 
 
 @dataclass(frozen=True)

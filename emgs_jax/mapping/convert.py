@@ -9,14 +9,13 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.device.arrays import on_device, to_se3
-from emgs_jax.device.executables import stored
 from emgs_jax.geometry import seen_from
 from emgs_jax.observation import Observation, ObservationConfig, Prediction, observe
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import PriorPrediction
 from emgs_jax.slam import SlamConfig
 
-_observe = stored(observe)
+_observe = eqx.filter_jit(observe)
 
 
 class FirstWindow(eqx.Module):

@@ -15,7 +15,6 @@ from jaxtyping import Array, Float
 
 from emgs_jax.back_end.state import BackEnd, transform_nodes
 from emgs_jax.device.arrays import on_device
-from emgs_jax.device.executables import stored
 from emgs_jax.existence import ExistenceConfig, Seen, take_back
 from emgs_jax.gaussian_map import GaussianMap, transform_rows
 from emgs_jax.geometry import Sim3, seen_from
@@ -45,7 +44,7 @@ def end_looks(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[Sla
     return replace(state, map=map, looks=None), each
 
 
-@stored
+@eqx.filter_jit
 def _end_looks(state: SlamState, view: Camera, config: ExistenceConfig) -> tuple[GaussianMap, Seen]:
     def end(map: GaussianMap, look: Looks) -> tuple[GaussianMap, Seen]:
         seen = as_seen(look, state.T_world_previous, state.estimate.depth_noise)
@@ -73,7 +72,7 @@ def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:
     return np.diag(0.5 * float(config.num_shared) * np.asarray(std, np.float64) ** 2)
 
 
-@stored
+@eqx.filter_jit
 def _own_std(
     estimate: PoseEstimate,
     last: Observation,
@@ -142,7 +141,7 @@ def rescale_atlas(atlas: Atlas, first: np.ndarray) -> Atlas:
     return with_state(replace(atlas, graph=graph), in_prior_unit(state, first[:3, 3]), atlas.config)
 
 
-@stored
+@eqx.filter_jit
 def _rescaled(state: SlamState, factor: Float[Array, ""], center: Float[Array, "3"]) -> SlamState:
     """Multiply all lengths of a state by `factor`, about a point."""
 

@@ -10,7 +10,6 @@ import numpy as np
 from emgs_jax.back_end.factors import FrameData
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.device.clock import Clock, Timer
-from emgs_jax.device.executables import forget_replaced
 from emgs_jax.loop_closure.prior_query import JointPrediction, PriorQuery
 from emgs_jax.mapping.convert import FirstWindow, opening, to_first_window, to_prediction
 from emgs_jax.observation import Prediction
@@ -76,7 +75,6 @@ def window_inputs(
         ValueError: no frame has a point and a pose from which a map can start, or predictions are in no unit that
             thresholds are for.
     """
-    forget_replaced()
     done: dict[int, np.ndarray] = {}  # raw poses
     is_started, clock, world, known = False, clock or Clock(), 0, set()
     for prediction, frames in predictions(dataset, prior, config.window_size, clock):

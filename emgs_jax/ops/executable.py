@@ -32,7 +32,7 @@ def executable(function: Callable[Arguments, Result]) -> Callable[Arguments, Res
 def calling(call: Call) -> Generator[None]:
     """Inside, and in this thread, `call(jitted, *arguments)` stands for `jitted(*arguments)` of every executable.
 
-    The host keeps executables from one process to the next by it, and lists what a step compiles before the first one.
+    The host lists by it what a step compiles, before the first one.
     """
     before = _call.set(call)
     try:

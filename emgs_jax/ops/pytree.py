@@ -1,6 +1,7 @@
 """Config fields and row operations that every other file uses."""
 
 from collections.abc import Sequence
+from dataclasses import MISSING
 from typing import Any, TypeVar
 
 import equinox as eqx
@@ -18,9 +19,9 @@ def _as_float32(value: Any) -> Any:
     return value if isinstance(value, jax.ShapeDtypeStruct) else jnp.asarray(value, jnp.float32)
 
 
-def traced(low: float | int | None = None, high: float | int | None = None) -> Any:
+def traced(default: Any = MISSING, low: float | int | None = None, high: float | int | None = None) -> Any:
     """A config field that is a number of the computation: changing it compiles nothing. `ops.ranges` has its ends."""
-    return eqx.field(converter=_as_float32, metadata=ranged(low, high))
+    return eqx.field(default=default, converter=_as_float32, metadata=ranged(low, high))
 
 
 def choice(*names: str) -> Any:
@@ -32,9 +33,11 @@ def choice(*names: str) -> Any:
     return eqx.field(converter=convert, metadata={"choices": names})
 
 
-def static_choice(*names: str) -> Any:
+def static_choice(*names: str, default: Any = MISSING) -> Any:
     """A config field that is one of `names`, a choice of code: each compiles once."""
-    return eqx.field(static=True, converter=lambda value: _one_of(names, value), metadata={"choices": names})
+    return eqx.field(
+        default=default, static=True, converter=lambda value: _one_of(names, value), metadata={"choices": names}
+    )
 
 
 def _one_of(names: Sequence[str], value: Any) -> str:
@@ -43,9 +46,9 @@ def _one_of(names: Sequence[str], value: Any) -> str:
     return value
 
 
-def static(low: float | int | None = None, high: float | int | None = None) -> Any:
+def static(default: Any = MISSING, low: float | int | None = None, high: float | int | None = None) -> Any:
     """A config field that is a shape, a loop bound or a choice of code: each value compiles once."""
-    return eqx.field(static=True, metadata=ranged(low, high))
+    return eqx.field(default=default, static=True, metadata=ranged(low, high))
 
 
 def take_rows(tree: Tree, rows: Int[Array, "*r"]) -> Tree:

@@ -22,9 +22,9 @@ def ranged(low: float | int | None, high: float | int | None) -> Mapping[str, An
     return {"range": Range(-LARGE if low is None else low, LARGE if high is None else high)}
 
 
-def number(low: float | int | None = None, high: float | int | None = None) -> Any:
+def number(default: Any = dataclasses.MISSING, low: float | int | None = None, high: float | int | None = None) -> Any:
     """A field of a plain dataclass that is one number, or several, from `low` to `high`."""
-    return dataclasses.field(metadata=ranged(low, high))
+    return dataclasses.field(default=default, metadata=ranged(low, high))
 
 
 def one_of(*names: str, default: Any = dataclasses.MISSING) -> Any:

@@ -2,7 +2,7 @@
 
 import hashlib
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
@@ -29,12 +29,12 @@ Result = TypeVar("Result")
 class Rates:
     """Adam's learning rate of each part of `Appearance`, and of the poses in standard deviations of each."""
 
-    colors: float = number(low=0, high=10)
-    logit: float = number(low=0, high=10)
-    log_std: float = number(low=0, high=10)
-    turn: float = number(low=0, high=10)
-    shift: float = number(low=0, high=10)
-    pose: float = number(low=0, high=10)
+    colors: float = number(0.03, low=0, high=10)
+    logit: float = number(0.05, low=0, high=10)
+    log_std: float = number(0.05, low=0, high=10)
+    turn: float = number(0.02, low=0, high=10)
+    shift: float = number(0.1, low=0, high=10)
+    pose: float = number(0.15, low=0, high=10)
 
 
 @dataclass(frozen=True)
@@ -59,19 +59,19 @@ class PolishConfig:
         loss: its weights.
     """
 
-    rates: Rates
-    loss: LossConfig
-    pixels_per_splat: int = number(low=1, high=10_000)
-    held_out_every: int = number(low=2, high=1_000_000)
-    steps: int = number(low=0, high=10_000_000)
-    final_rate: float = number(low=1e-6, high=1)
-    opacity: float = number(low=0.01, high=0.99)
-    min_opacity: float = number(low=0, high=1)
-    every: int = number(low=1, high=10_000_000)
-    seed: int = number(low=0, high=2**31 - 1)
-    pose_steps: int = number(low=0, high=10_000)
-    exposures: float = number(low=0, high=1)
-    poses: bool
+    rates: Rates = field(default_factory=Rates)
+    loss: LossConfig = field(default_factory=LossConfig)
+    pixels_per_splat: int = number(4, low=1, high=10_000)
+    held_out_every: int = number(8, low=2, high=1_000_000)
+    steps: int = number(400, low=0, high=10_000_000)
+    final_rate: float = number(0.1, low=1e-6, high=1)
+    opacity: float = number(0.9, low=0.01, high=0.99)
+    min_opacity: float = number(0.05, low=0, high=1)
+    every: int = number(100, low=1, high=10_000_000)
+    seed: int = number(0, low=0, high=2**31 - 1)
+    pose_steps: int = number(30, low=0, high=10_000)
+    exposures: float = number(0.8, low=0, high=1)
+    poses: bool = True
 
 
 def is_held_out(row: int, config: PolishConfig) -> bool:

@@ -1,5 +1,6 @@
 """Flat splats on the map's surface, what of them is fitted, and by which loss."""
 
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -65,6 +66,10 @@ class Shot(NamedTuple):
     gain: Float[Array, "3"]
 
 
+# As 3DGS draws; where a tile's capacity is too little it is doubled.
+AS_3DGS = {"tile_size": 8, "tile_capacity": 192, "tile_batch": 1024, "opacity": 1.0}
+
+
 class LossConfig(eqx.Module):
     """Weights of the loss, and how splats are drawn.
 
@@ -75,10 +80,10 @@ class LossConfig(eqx.Module):
         render: how splats are drawn; its opacity is that of a splat with opacity 1.
     """
 
-    dssim: Float[Array, "*b"] = traced(low=0, high=1)
-    depth: Float[Array, "*b"] = traced(low=0)
-    normal: Float[Array, "*b"] = traced(low=0)
-    render: RenderConfig
+    dssim: Float[Array, "*b"] = traced(0.2, low=0, high=1)
+    depth: Float[Array, "*b"] = traced(0.5, low=0)
+    normal: Float[Array, "*b"] = traced(0.1, low=0)
+    render: RenderConfig = eqx.field(default_factory=partial(RenderConfig, **AS_3DGS))
 
 
 def initial(colors: Float[Array, "n 3"], opacity: Float[Array, ""]) -> Appearance:

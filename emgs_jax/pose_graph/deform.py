@@ -22,8 +22,8 @@ class DeformConfig(eqx.Module):
         max_gap: nodes between the births of a Gaussian and of one that counts: two visits of a place move apart.
     """
 
-    num_neighbours: int = static(low=1, high=256)
-    max_gap: Float[Array, "*b"] = traced(low=0)
+    num_neighbours: int = static(9, low=1, high=256)
+    max_gap: Float[Array, "*b"] = traced(40.0, low=0)
 
 
 class _Motions(eqx.Module):

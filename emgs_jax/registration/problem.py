@@ -50,21 +50,21 @@ class IcpConfig(eqx.Module):
     """
 
     residual: Float[Array, "*b"] = choice(*RESIDUALS)
-    color_std: Float[Array, "*b"] = traced(low=0.0001)
-    noise: Float[Array, "*b"] = traced(low=0)
-    max_misfit: Float[Array, "*b"] = traced(low=0)
-    max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
     prior_information: Float[Array, "*b"] = traced(low=0, high=1e9)
     scale_noise: Float[Array, "*b"] = traced(low=0, high=1000)
     max_field: Float[Array, "*b"] = traced(low=0, high=10)
-    field_length: Float[Array, "*b"] = traced(low=1e-3, high=100)
-    num_points: int = static(low=1, high=2**24)
-    num_searches: int = static(low=1, high=100)
-    num_neighbours: int = static(low=1, high=256)
-    num_color_neighbours: int = static(low=1, high=256)
-    max_steps: int = static(low=0, high=1000)
-    tolerance: float = static(low=1e-7, high=1)
+    color_std: Float[Array, "*b"] = traced(0.1, low=0.0001)
+    noise: Float[Array, "*b"] = traced(1.0, low=0)
+    max_misfit: Float[Array, "*b"] = traced(0.1, low=0)
+    max_mahalanobis_sq: Float[Array, "*b"] = traced(9.0, low=0, high=math.inf)
+    min_normal_cos: Float[Array, "*b"] = traced(0.5, low=-math.inf, high=1)
+    field_length: Float[Array, "*b"] = traced(0.3, low=1e-3, high=100)
+    num_points: int = static(3200, low=1, high=2**24)
+    num_searches: int = static(2, low=1, high=100)
+    num_neighbours: int = static(8, low=1, high=256)
+    num_color_neighbours: int = static(12, low=1, high=256)
+    max_steps: int = static(4, low=0, high=1000)
+    tolerance: float = static(0.0001, low=1e-7, high=1)
 
 
 class Uncertainty(eqx.Module):

@@ -39,14 +39,14 @@ class RenderConfig(eqx.Module):
         min_alpha: a pixel with less coverage has no depth.
     """
 
-    tile_size: int = static(low=1, high=1024)
-    tile_capacity: int = static(low=1, high=2**20)
-    tile_batch: int = static(low=1, high=2**20)
-    opacity: Float[Array, "*b"] = traced(low=0, high=1)
-    covariance_scale: Float[Array, "*b"] = traced(low=1e-6)
-    blur: Float[Array, "*b"] = traced(low=0)
-    radius: Float[Array, "*b"] = traced(low=0)
-    min_alpha: Float[Array, "*b"] = traced(low=0, high=1)
+    tile_size: int = static(16, low=1, high=1024)
+    tile_capacity: int = static(1024, low=1, high=2**20)
+    tile_batch: int = static(256, low=1, high=2**20)
+    opacity: Float[Array, "*b"] = traced(0.9, low=0, high=1)
+    covariance_scale: Float[Array, "*b"] = traced(1.0, low=1e-6)
+    blur: Float[Array, "*b"] = traced(0.3, low=0)
+    radius: Float[Array, "*b"] = traced(3.0, low=0)
+    min_alpha: Float[Array, "*b"] = traced(0.3, low=0, high=1)
 
 
 class Rendering(eqx.Module):

@@ -39,11 +39,11 @@ class DensifyConfig(eqx.Module):
             `emgs_jax.report.dense.uncontradicted`.
     """
 
-    surface_depth: Float[Array, "*b"] = traced(low=0)
-    min_alpha: Float[Array, "*b"] = traced(low=0, high=1)
     min_std: Float[Array, "*b"] = traced(low=0, high=1000)
     render: RenderConfig
     points: str = static_choice("map", "own")
+    surface_depth: Float[Array, "*b"] = traced(0.05, low=0)
+    min_alpha: Float[Array, "*b"] = traced(0.3, low=0, high=1)
 
 
 class DenseView(eqx.Module):

@@ -11,7 +11,6 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.device.arrays import fetched, to_se3
-from emgs_jax.device.executables import stored
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.evaluation.reconstruction import EvaluationConfig, camera_cloud, own_voxel, posed
 from emgs_jax.evaluation.rendering import Rendered
@@ -25,7 +24,7 @@ from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.report.labelling import LabelledMap
 from emgs_jax.report.moving import moving_mask, with_moving
 
-_densify = stored(densify)
+_densify = eqx.filter_jit(densify)
 
 
 @dataclass(frozen=True)

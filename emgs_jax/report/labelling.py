@@ -3,12 +3,12 @@
 from dataclasses import dataclass
 from functools import cached_property
 
+import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float, Int
 
 from emgs_jax.device.arrays import on_device
-from emgs_jax.device.executables import stored
 from emgs_jax.evaluation.clouds import NearestPoints
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.gaussian_map import confirmed
@@ -18,7 +18,7 @@ from emgs_jax.semantics import classify, similarities
 
 NUM_NEIGHBOURS = 8  # Gaussians that may explain a point
 MAX_POINTS = 10_000  # at once; bounds the memory, does not change the result
-_classify, _similarities = stored(classify), stored(similarities)
+_classify, _similarities = eqx.filter_jit(classify), eqx.filter_jit(similarities)
 
 
 @dataclass(frozen=True)

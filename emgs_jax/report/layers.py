@@ -14,7 +14,6 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from emgs_jax.device.arrays import on_device
-from emgs_jax.device.executables import stored
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import GaussianMap, confirmed
 from emgs_jax.gaussians import Gaussians
@@ -23,7 +22,7 @@ from emgs_jax.semantics import principal_colors, similarities
 
 COV_UNIT = 1e-4  # m²; float16 then holds standard deviations from .1 mm to 2.5 m
 _LARGEST_HALF = 65504.0
-_similarities, feature_colors = stored(similarities), stored(principal_colors)
+_similarities, feature_colors = eqx.filter_jit(similarities), eqx.filter_jit(principal_colors)
 _UPPER = np.triu_indices(3)
 # Gaussians as viewers draw them are wide enough along the surface that it has no gaps.
 _NUM_NEIGHBOURS = 6  # as many as touch a disc in a dense packing

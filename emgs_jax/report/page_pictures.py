@@ -3,6 +3,7 @@
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jaxlie
 import matplotlib
@@ -11,7 +12,6 @@ from PIL import Image
 
 from emgs_jax.data.base import BadFrameError, Dataset
 from emgs_jax.device.arrays import fetched, to_se3
-from emgs_jax.device.executables import stored
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, downscale
@@ -43,7 +43,7 @@ class Views(NamedTuple):
     far: float
 
 
-@stored
+@eqx.filter_jit
 def _drawn(gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: RenderConfig) -> tuple[jax.Array, jax.Array]:
     drawing = render(gaussians, gaussians.colors, pose, camera, config)
     return drawing.values, drawing.depth

@@ -11,6 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import CONF, compose
 from emgs_jax.config.overrides import written
+from emgs_jax.config.schema import SCHEMAS, schema_of
 from emgs_jax.config.values import field_of
 from emgs_jax.io.files import flat, jsonable
 
@@ -92,10 +93,12 @@ def _default_options() -> dict[str, str]:
 
 def _content(path: Path) -> dict[str, Any]:
     """Read values by dotted key of a file of conf/, with those that it inherits from others beside it."""
-    node = _read(path)
-    parents = [path.parent / f"{name}.yaml" for name in node.pop("defaults", []) if isinstance(name, str)]
-    inherited = [_content(parent) for parent in parents if parent.is_file()]
-    return {key: value for part in [*inherited, flat(node)] for key, value in part.items()}
+    node, found = _read(path), {}
+    for name, _, place in (str(line).partition("@") for line in node.pop("defaults", [])):
+        parent, schema = path.parent / f"{name}.yaml", f"{path.parent.relative_to(CONF).as_posix()}/{name}"
+        inherited = _content(parent) if parent.is_file() else flat(schema_of(schema)) if schema in SCHEMAS else {}
+        found |= {f"{place}.{key}" if place else key: value for key, value in inherited.items()}
+    return found | flat(node)
 
 
 def _read(path: Path) -> dict[str, Any]:
@@ -104,7 +107,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 def check_targets(settings: Any) -> None:
     """Raise ValueError where settings name a class that conf/ does not: a file from elsewhere must not choose code."""
-    trees = [{"": settings}, *map(_read, CONF.rglob("*.yaml"))]
+    trees = [{"": settings}, *map(_read, CONF.rglob("*.yaml")), *map(schema_of, SCHEMAS)]
     named, *known = ({v for key, v in flat(tree).items() if key.endswith("_target_")} for tree in trees)
     if unknown := named.difference(*known):
         raise ValueError(f"metrics.json names {sorted(map(str, unknown))}, which no file of conf/ does: run again")

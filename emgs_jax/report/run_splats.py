@@ -13,7 +13,6 @@ import numpy as np
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.device.arrays import on_device, to_se3
-from emgs_jax.device.executables import compiling, stored
 from emgs_jax.evaluation.rendering import rendering_metrics, score_view
 from emgs_jax.evaluation.trajectory import align_poses, ate
 from emgs_jax.gaussian_map import confirmed
@@ -40,7 +39,7 @@ OPTAX = "optax", "splats are fitted by optax (polish=none fits none)", "polish" 
 MAX_PICTURES = 4
 Seen: TypeAlias = tuple[np.ndarray, DenseView]  # image (h, w, 3) in [0, 1] of a frame, and the map from its pose
 Nearest: TypeAlias = Callable[[np.ndarray], np.ndarray]
-_densify, _classify = stored(densify), stored(classify)
+_densify, _classify = eqx.filter_jit(densify), eqx.filter_jit(classify)
 _ssim, _gain = jax.jit(ssim), jax.jit(relative_gain)
 
 
@@ -78,7 +77,7 @@ def polish(
 
     nearest = _nearest(gaussians)
     seeds, targets, gains = Seeds(run.camera, config.pixels_per_splat), Spool(), []
-    for row in Bar(fitted_rows, desc="splats", unit="frame", doing=compiling):
+    for row in Bar(fitted_rows, desc="splats", unit="frame"):
         image, view = seen(row)
         seeds.add(view, image, run.poses[row])
         targets.append(target_of(image, view))
@@ -111,7 +110,7 @@ def _fitted(
     anchors: Anchors, colors: np.ndarray, views: Views, run: FinishedRun, config: PolishConfig
 ) -> tuple[Appearance, Views]:
     """`fit` with a progress bar."""
-    with Bar(total=config.steps, desc="polishing", unit="step", doing=compiling) as bar:
+    with Bar(total=config.steps, desc="polishing", unit="step") as bar:
         recent: list[float] = []
 
         def on_step(step: int, psnr: float) -> None:
@@ -206,7 +205,7 @@ def _compare(
     scores: dict[str, list] = {"before": [], "after": []}
     psnr, similarity = {name: [] for name in scores}, {name: [] for name in scores}
     strips = []
-    for row in Bar(held, desc="held-out frames", unit="frame", doing=compiling):
+    for row in Bar(held, desc="held-out frames", unit="frame"):
         image, view = seen(row)
         after, terms = with_room(partial(_picture, splats, opacity, to_se3(poses[row]), run.camera), terms)
         pictures = {

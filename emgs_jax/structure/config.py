@@ -8,6 +8,13 @@ from emgs_jax.data.masks import Masks
 from emgs_jax.ops.ranges import number, one_of
 
 PARTS = ("extraction", "matching", "verification", "incremental", "global")  # of the options
+# Fewer and shorter adjustments in between: all is adjusted once more in the end.
+RARE_ADJUSTMENTS = {
+    "ba_global_frames_ratio": 1.3,
+    "ba_global_points_ratio": 1.3,
+    "ba_global_function_tolerance": 1e-6,
+    "ba_local_function_tolerance": 1e-5,
+}
 
 
 @dataclass(frozen=True)
@@ -37,24 +44,26 @@ class StructureConfig:
         pixel_std: least standard deviation of a keypoint; that of the residuals where it is larger.
     """
 
-    model: str | None
-    features: str
-    matcher: str | None
-    mapper: str = one_of("incremental", "global")
-    camera_model: str
-    refine_distortion: bool
-    masks: Masks
-    seed: int = number(low=0, high=2**31 - 1)
-    num_threads: int = number(low=-1, high=1024)
-    max_image_size: int = number(low=64, high=16384)
-    max_exhaustive: int = number(low=2, high=10000)
-    overlap: int = number(low=1, high=1000)
-    num_similar: int = number(low=0, high=1000)
-    min_inliers: int = number(low=4, high=1000)
-    max_gap: int = number(low=0, high=1000)
-    median_depth: float = number(low=1e-6, high=1e6)
-    pixel_std: float = number(low=1e-3, high=100)
-    options: Mapping[str, Any] = field(default_factory=dict)
+    model: str | None = None
+    features: str = "sift"
+    matcher: str | None = None
+    mapper: str = one_of("incremental", "global", default="incremental")
+    camera_model: str = "SIMPLE_RADIAL"
+    refine_distortion: bool = True
+    masks: Masks = field(default_factory=Masks)
+    seed: int = number(0, low=0, high=2**31 - 1)
+    num_threads: int = number(-1, low=-1, high=1024)
+    max_image_size: int = number(1024, low=64, high=16384)
+    max_exhaustive: int = number(50, low=2, high=10000)
+    overlap: int = number(10, low=1, high=1000)
+    num_similar: int = number(5, low=0, high=1000)
+    min_inliers: int = number(15, low=4, high=1000)
+    max_gap: int = number(3, low=0, high=1000)
+    median_depth: float = number(2.0, low=1e-6, high=1e6)
+    pixel_std: float = number(0.4, low=1e-3, high=100)
+    options: Mapping[str, Any] = field(
+        default_factory=lambda: {part: {} for part in PARTS} | {"incremental": RARE_ADJUSTMENTS}
+    )
 
     def __post_init__(self) -> None:
         for part, values in self.options.items():

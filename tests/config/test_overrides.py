@@ -6,7 +6,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from emgs_jax.config.configure import compose
-from emgs_jax.config.overrides import joined, parsed, quoted, readable
+from emgs_jax.config.overrides import parsed, quoted, readable
 
 NAMES = (
     *(
@@ -56,21 +56,8 @@ def test_a_number_stays_one_whatever_its_key_ends_with_and_whatever_folders_ther
         assert parsed(readable([f"{name}=1"])[0]).value() == "1"
 
 
-def test_choices_of_a_multirun_are_files_each(tmp_path, monkeypatch):
-    monkeypatch.chdir(tmp_path)
-    for name in ("Küche", "Bad (1)"):
-        (tmp_path / name).mkdir()
-    found = parsed(readable(["dataset.root=Küche,Bad (1)"])[0])
-    assert [item.text for item in found.sweep_iterator()] == ["Küche", "Bad (1)"]
-
-
-def test_lists_that_a_shell_has_cut_are_put_together_and_their_items_are_text_where_need_be():
-    words = "dataset.intrinsics=[525, 525.5, 319, 239] -m prior.seed=1,2 x={a: 1, b: [2, 3]} --cfg job"
-    found = readable(words.split())
-    assert parsed(found[0]).value() == [525, 525.5, 319, 239] and parsed(found[3]).value() == {"a": 1, "b": [2, 3]}
-    assert found[1:3] + found[4:] == ["-m", "prior.seed=1,2", "--cfg", "job"]
+def test_items_of_a_list_are_text_where_need_be():
     assert parsed(readable(["text=[Stühle,Tisch (rund), wall]"])[0]).value() == ["Stühle", "Tisch (rund)", "wall"]
-    assert joined(["a=[1,", "b"]) == ["a=[1,", "b"]  # without an end
 
 
 def test_what_hydra_reads_stays_as_it_is():

@@ -16,7 +16,6 @@ from tiny_run import NUM_FRAMES, compose, make_exact_run
 
 import experiments.run
 from emgs_jax.data.synthetic import Synthetic
-from emgs_jax.device import executables
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
 
@@ -44,7 +43,6 @@ def runs(tmp_path_factory, shared_folder):
         jax.config.update("jax_compilation_cache_dir", str(folder))
         for name in ("cold", "warm"):
             jax.clear_caches()
-            executables.forget()
             compilation_cache.reset_cache()
             reads.clear()
             out = tmp_path_factory.mktemp(name)

@@ -10,7 +10,6 @@ import pytest
 from listening import compiled
 from scene import FULL, WHOLE, first_window, observe_room, path_pose, predict_room, slam_config, stack_poses
 
-from emgs_jax.device.executables import forget
 from emgs_jax.gaussian_map import grow
 from emgs_jax.mapping.capacity import advance, prepare_step, start
 from emgs_jax.ops.pytree import stack
@@ -25,7 +24,6 @@ def prepared(camera):
     poses = [path_pose(i) for i in range(3)]
     first = first_window(stack([observe_room(T, camera, num_features=2) for T in poses]), stack_poses(poses))
     jax.clear_caches()
-    forget()
     with compiled() as names:
         prepare_step(first.views, FULL, config)
     return *start(first, FULL, config), names

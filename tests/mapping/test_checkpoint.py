@@ -5,6 +5,7 @@ import itertools
 import json
 import os
 import signal
+import time
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
@@ -36,7 +37,6 @@ from emgs_jax.mapping.checkpoint import (
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.slam import SlamState
-from tools.kills.folders import log_lines
 
 pytestmark = pytest.mark.xdist_group("tiny")
 
@@ -47,6 +47,12 @@ OVERRIDES = ("prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=51
 GRAPH = ("graph=default", "graph.every=1")
 MOVING = ("slam/motion=default", "slam.motion.num_looks=2", "slam.motion.prior=1", "dataset.movers=1")
 SHOWS_TIMES = {"metrics.json", "frames.jsonl", "overview.png", "report.html"}
+
+
+def log_lines(folder: Path) -> list[dict]:
+    """frames.jsonl without its times."""
+    found = [json.loads(line) for line in (folder / "frames.jsonl").read_text().splitlines()]
+    return [{key: value for key, value in line.items() if "seconds" not in key} for line in found]
 
 
 class Stopped(BaseException):
@@ -181,6 +187,33 @@ def test_a_scheduler_ends_a_run_with_one_word_and_the_same_command_goes_on(tmp_p
     assert len(steps) < NUM_FRAMES - 1, "in another process"
     for name in ("map.npz", "trajectory.txt"):
         assert (folder / name).read_bytes() == (whole()[0] / name).read_bytes(), name
+
+
+@pytest.mark.weekly
+@pytest.mark.parametrize("more", [(), GRAPH])
+@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
+def test_a_run_that_is_killed_at_any_time_again_and_again_comes_to_the_same_bits(tmp_path, sign, more):
+    """Before its first frame, between frames, and while it exports: every file is whole or not there."""
+    folder, said, log = tmp_path / "run", tmp_path / "said", tmp_path / "run" / "frames.jsonl"
+    words = (*TINY, *OVERRIDES, *more, f"hydra.run.dir={folder}")
+    rng, expected = np.random.default_rng(0), whole(*more)[0]
+    for num_lines in (0, 2, NUM_FRAMES - 1, NUM_FRAMES):
+        program = begin("experiments.run", *words, said=said)
+        is_there = partial(
+            lambda count: not count or log.exists() and log.read_bytes().count(b"\n") >= count, num_lines
+        )
+        wait_for(is_there, program)
+        time.sleep(rng.uniform(0, 2))
+        os.kill(program.pid, sign)
+        assert ended(program) in (0, -sign, 128 + sign), said.read_text()
+        for name in ("map.npz", "trajectory.txt", "metrics.json"):
+            if (folder / name).exists():
+                assert (folder / name).stat().st_size == (expected / name).stat().st_size or name in SHOWS_TIMES
+    assert ended(begin("experiments.run", *words, said=said)) == 0 and "Traceback" not in said.read_text()
+    for path in expected.iterdir():
+        if path.name not in SHOWS_TIMES:
+            assert (folder / path.name).read_bytes() == path.read_bytes(), path.name
+    assert log_lines(folder) == log_lines(expected) and not [*folder.glob(".*tmp*")]
 
 
 def test_a_run_does_not_go_on_in_the_map_that_it_would_replace(tmp_path):

@@ -12,7 +12,7 @@ from emgs_jax.back_end.state import BackEnd
 from emgs_jax.geometry import seen_from
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.mapping.tracking import covariance_of_map
-from tools.nees.consistency import nees, pose_errors
+from tools.nees import nees, pose_errors
 
 COUNT, NUM_DRAWS = 12, 4000
 ORIGINS = (None, 0, 0, 1, 3, 4, 4, 6, 7, 2, 0, 9)  # on the way out the frames before; then what was seen on it

@@ -26,7 +26,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.report.run_files import save_progress
 from emgs_jax.slam import SlamState, as_seen
-from tools.nees.consistency import pose_errors
+from tools.nees import pose_errors
 
 COUNT = 1e6  # repeats beside which the guess does not count
 DIFFERENCE = np.array([0.01, 0.004])  # between two answers about a motion: mean depths and rad, per axis

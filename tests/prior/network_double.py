@@ -11,9 +11,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import Frame
-from emgs_jax.prior.network.framework import NORMALIZATIONS
+from emgs_jax.prior.network.framework import DEVIATION, MEAN, NORM, PATCH
 
-KEYS = {"img", "data_norm_type", "intrinsics", "camera_poses", "is_metric_scale", "true_shape", "instance"}
+KEYS = {"img", "data_norm_type", "intrinsics", "camera_poses", "is_metric_scale"}
 
 
 def rigid(rotation, translation):
@@ -67,8 +67,6 @@ class Double:
     Args:
         scene: `which`, `pose` and `depth` as in `Sphere`.
         convert: from arrays to what it gives out.
-        unit: by what it multiplies lengths in its n-th call.
-        patch: of its grid.
         spoil: changes the outputs of one view in place.
     """
 
@@ -76,12 +74,9 @@ class Double:
         self,
         scene,
         convert: Callable = np.asarray,
-        unit: Callable[[int], float] = lambda call: 1.0,
         spoil: Callable = lambda index, output: None,
-        patch: int = 14,
     ):
-        self._scene, self._convert, self._unit, self._spoil, self._patch = scene, convert, unit, spoil, patch
-        self.num_calls = 0
+        self._scene, self._convert, self._spoil = scene, convert, spoil
         self.seen = []  # keys of every view of the last call
 
     def infer(
@@ -96,35 +91,25 @@ class Double:
         assert not apply_mask, "this double gives no masks"
         if use_amp:
             raise RuntimeError("Index put requires the source and destination dtypes match")  # as on a CPU
-        return self.answer(views)
-
-    def answer(self, views):
-        check_views(views, self._patch)
+        check_views(views)
         self.seen = [set(view) for view in views]
         images = [self._image(view) for view in views]
         numbers = [self._scene.which(image) for image in images]
         poses = [NEARLY_IDENTITY @ np.linalg.inv(self._scene.pose(numbers[0])) @ self._scene.pose(n) for n in numbers]
-        unit = self._unit(self.num_calls) * (1.05 if "camera_poses" in views[0] else 1.0)
+        unit = 1.05 if "camera_poses" in views[0] else 1.0
         if np.asarray(views[0].get("is_metric_scale", True)).all():
             unit *= 1.1  # its features differ
-        self.num_calls += 1
         outputs = []
         for view, number, image, T in zip(views, numbers, images, poses, strict=True):
             height, width = image.shape[:2]
-            K = np.asarray(view["intrinsics"])[0] if "intrinsics" in view else self._default_intrinsics(width)
+            K = np.asarray(view["intrinsics"])[0]
             outputs.append(self._output(number, K, (width, height), T, unit))
             for key in view:
                 view[key] = None
         return outputs
 
-    def _default_intrinsics(self, width):
-        fx, fy, cx, cy = self._scene.intrinsics
-        s = width / self._scene.size[0]
-        return np.array([[fx * s, 0, (cx + 0.5) * s - 0.5], [0, fy * s, (cy + 0.5) * s - 0.5], [0, 0, 1]], np.float32)
-
     def _image(self, view):
-        mean, deviation = NORMALIZATIONS[view["data_norm_type"][0]]
-        return np.asarray(view["img"])[0].transpose(1, 2, 0) * deviation + mean
+        return (np.asarray(view["img"])[0] * DEVIATION + MEAN).transpose(1, 2, 0)
 
     def _output(self, number, intrinsics, size, T, unit):
         depth = unit * self._scene.depth(number, intrinsics.astype(float), size)
@@ -145,16 +130,16 @@ class Double:
         return {key: self._convert(value) for key, value in output.items()}
 
 
-def check_views(views, patch=14):
+def check_views(views):
     """Raise what the real model raises for views that break its contract (part A.5 of the reference)."""
     for number, view in enumerate(views):
         if set(view) - KEYS:
             raise ValueError(f"View {number} contains invalid keys: {set(view) - KEYS}")
         if not {"img", "data_norm_type"} <= set(view):
             raise ValueError(f"View {number} missing required keys")
-        assert view["data_norm_type"][0] in NORMALIZATIONS, view["data_norm_type"]
+        assert view["data_norm_type"] == [NORM]
         height, width = view["img"].shape[2:]
-        assert height % patch == 0 and width % patch == 0, (
+        assert height % PATCH == 0 and width % PATCH == 0, (
             f"Input shape must be divisible by patch size: {height, width}"
         )
         if tuple(view["img"].shape) != tuple(views[0]["img"].shape):

@@ -1,4 +1,4 @@
-"""Checkpoints and networks for the tests of the loading, where the package mapanything need not be installed."""
+"""Checkpoints for the tests of the loading, where the package mapanything need not be installed."""
 
 import json
 from pathlib import Path
@@ -9,8 +9,8 @@ from emgs_jax.prior.network.framework import ComputeConfig
 from emgs_jax.prior.network.torch_network import load_network
 
 
-def load(model="mapanything", checkpoint=None, device="cpu", amp="bf16"):
-    return load_network(model, checkpoint, ComputeConfig(device, amp, True, 1))
+def load(checkpoint, device="cpu", amp="bf16"):
+    return load_network(checkpoint, ComputeConfig(device, amp, True, 1))
 
 
 def write_checkpoint(folder: Path, encoder: dict) -> Path:
@@ -38,30 +38,3 @@ def clone(hub: Path) -> Path:
 
 WEIGHTS = {"head__weight": (2, 3), "head__bias": (2,)}
 DINOV2 = {"encoder_str": "dinov2_giant_24_layers", "torch_hub_pretrained": False}
-
-
-class Loaded:
-    """A network that the framework has configured: the double, with the methods of a module."""
-
-    dtype, amp = None, "bf16"  # of the framework's wrappers
-
-    def __init__(self, double, reads=()):
-        self._double, self._reads, self.is_evaluated = double, reads, False
-
-    def to(self, device):
-        return self
-
-    def eval(self):
-        self.is_evaluated = True
-        return self
-
-    def infer(self, views, **options):
-        assert self.is_evaluated
-        return self._double.infer(views, **options)
-
-    def __call__(self, views):
-        self.given = views
-        for key in self._reads:  # beyond what MapAnything takes, and a KeyError where it is not there
-            assert all(len(view[key]) == 1 for view in views), key
-        taken = [{key: value for key, value in view.items() if key not in self._reads} for view in views]
-        return self._double.answer(taken)

@@ -40,12 +40,12 @@ def test_the_words_compose_the_same_config(words):
 
 def test_words_are_few_and_say_the_default_beside():
     settings = settings_of("dataset=apartment", "slam.em.max_log_gap=9.5", "render.opacity=.5")
-    assert repeat(settings).words == ["dataset=apartment", "slam.em.max_log_gap=9.5", "render.opacity=0.5"]
+    assert repeat(settings).words == ["dataset=apartment", "render.opacity=0.5", "slam.em.max_log_gap=9.5"]
     default = settings_of()
     assert repeat(settings).differences == [
         ("dataset", "apartment", "synthetic"),
-        ("slam.em.max_log_gap", 9.5, default["slam"]["em"]["max_log_gap"]),
         ("render.opacity", 0.5, default["render"]["opacity"]),
+        ("slam.em.max_log_gap", 9.5, default["slam"]["em"]["max_log_gap"]),
     ]
 
 

@@ -14,7 +14,7 @@ from emgs_jax.prior.multiview.lens import Lens
 from emgs_jax.structure.model import Structure
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DenseConfig:
     """Settings of a view's dense depth: what is accepted.
 
@@ -26,9 +26,9 @@ class DenseConfig:
     """
 
     noise: DepthNoiseConfig
-    num_checks: int = number(low=0, high=64)
-    depth_step: float = number(low=1e-6)
-    depth_margin: float = number(low=1, high=1000)
+    num_checks: int = number(4, low=0, high=64)
+    depth_step: float = number(0.02, low=1e-6)
+    depth_margin: float = number(1.4, low=1, high=1000)
 
 
 class Scene(NamedTuple):

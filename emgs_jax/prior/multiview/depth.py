@@ -1,6 +1,7 @@
 """Dense depth of one view from several others, with holes where the images do not determine it."""
 
 import math
+from dataclasses import field
 
 import equinox as eqx
 import jax
@@ -26,12 +27,12 @@ class DepthConfig(eqx.Module):
         median_radius: half the side of the window whose median replaces a depth: removes speckle, keeps edges.
     """
 
-    sweep: SweepConfig
-    semi_global: SemiGlobalConfig
-    max_cost: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    min_margin: Float[Array, "*b"] = traced(low=0)
-    temperature: Float[Array, "*b"] = traced(low=1e-6)
-    median_radius: int = static(low=0, high=32)
+    sweep: SweepConfig = field(default_factory=SweepConfig)
+    semi_global: SemiGlobalConfig = field(default_factory=SemiGlobalConfig)
+    max_cost: Float[Array, "*b"] = traced(0.4, low=0, high=math.inf)
+    min_margin: Float[Array, "*b"] = traced(0.0, low=0)
+    temperature: Float[Array, "*b"] = traced(0.05, low=1e-6)
+    median_radius: int = static(2, low=0, high=32)
 
 
 def _between_planes(total: Float[Array, "h w d"], best: Array) -> Float[Array, "h w"]:

@@ -29,7 +29,7 @@ SUFFIXES = (".npz", ".npy", ".pfm", ".exr", ".png")  # the first that is there i
 KEYS = ("depth", "depths", "disparity", "disparities", "inverse_depth", "prediction")  # of an .npz with several arrays
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class DepthFilesConfig(MonocularConfig):
     """Depths in files.
 
@@ -39,7 +39,7 @@ class DepthFilesConfig(MonocularConfig):
     """
 
     folder: str
-    depth_scale: float = number(low=1e-3, high=1e6)
+    depth_scale: float = number(1000.0, low=1e-3, high=1e6)
 
 
 class DepthFiles(NamedTuple):

@@ -8,7 +8,6 @@ the cost curve is, δ by how much the depths of other views differ. The factors 
 Student t, as some depths are outliers), on scenes whose depth is known.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -50,30 +49,3 @@ def relative_std(
     by_match = config.pixel_std / np.where(pixels > 0, pixels, 1.0)
     parts = by_match, config.spread_std * spread, config.difference_std * difference
     return np.float32(np.where(pixels > 0, np.sqrt(sum(part**2 for part in parts)), np.inf))
-
-
-def surest(
-    depths: Sequence[Float[np.ndarray, "h w"]], stds: Sequence[Float[np.ndarray, "h w"]]
-) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Of several estimates of a depth the surest, with those that agree with it, and its standard deviation.
-
-    Those within twice the standard deviation of their difference are averaged in log z, by 1/σ². The images are the
-    same for all, so the mean is taken for no surer than the surest.
-
-    Args:
-        depths: m, 0 where it is not known.
-        stds: of log z.
-    """
-    depth = np.stack(depths)
-    is_known = (depth > 0) & np.isfinite(np.stack(stds))
-    std = np.where(is_known, np.stack(stds), np.inf)
-    best = np.argmin(std, axis=0)[None]
-    is_any = is_known.any(axis=0)
-    least, at = (
-        np.where(is_any, np.take_along_axis(each, best, axis=0), np.float32(1.0)) for each in (np.float32(std), depth)
-    )
-    offset = np.log(np.where(is_known, depth, at) / at)
-    weight = (np.maximum(least, 1e-6) / np.maximum(std, 1e-6)) ** 2 * (np.abs(offset) <= 2.0 * np.hypot(std, least))
-    weight = np.where(is_known, weight, 0.0)
-    mean = np.sum(weight * offset, axis=0) / np.where(is_any, np.sum(weight, axis=0), 1.0)
-    return np.float32(np.where(is_any, at[0] * np.exp(mean), 0.0)), np.float32(np.where(is_any, least[0], np.inf))

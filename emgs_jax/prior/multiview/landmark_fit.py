@@ -41,14 +41,14 @@ class LandmarkFitConfig:
         num_steps: of the iteration.
     """
 
-    std: float = number(low=1e-4, high=10)
-    step_std: float = number(low=1e-6, high=10)
-    shift_std: float = number(low=1e-3, high=100)
-    dof: float = number(low=1, high=1000)
-    weight: float = number(low=0, high=1000)
-    min_landmarks: int = number(low=3, high=10000)
-    min_correlation: float = number(low=0, high=1)
-    num_steps: int = number(low=1, high=1000)
+    std: float = number(0.05, low=1e-4, high=10)
+    step_std: float = number(0.01, low=1e-6, high=10)
+    shift_std: float = number(1.0, low=1e-3, high=100)
+    dof: float = number(4.0, low=1, high=1000)
+    weight: float = number(3.0, low=0, high=1000)
+    min_landmarks: int = number(12, low=3, high=10000)
+    min_correlation: float = number(0.3, low=0, high=1)
+    num_steps: int = number(20, low=1, high=1000)
 
 
 class LandmarkFit(NamedTuple):

@@ -1,6 +1,6 @@
 """Dense depth by a network for multi-view stereo, whose weights the user brings."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -14,9 +14,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.lens import Lens, rectify
 from emgs_jax.prior.multiview.matched import MatchedConfig, Stereo
-from emgs_jax.prior.multiview.swept import SweptConfig
-from emgs_jax.prior.pretrained import effimvs, itermvs
-from emgs_jax.prior.pretrained.effimvs import EffiMVSConfig
+from emgs_jax.prior.pretrained import itermvs
 from emgs_jax.prior.pretrained.itermvs import IterMVSConfig
 from emgs_jax.prior.pretrained.weights import load_network
 from emgs_jax.prior.sources import Sources
@@ -27,7 +25,7 @@ MULTIPLE = 32  # of pixels; the networks halve their images five times
 jitted = cache(eqx.filter_jit)  # one for all priors of a process
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class LearnedConfig(MatchedConfig):
     """Depth by a network.
 
@@ -35,14 +33,12 @@ class LearnedConfig(MatchedConfig):
         magnification: of the images that it is shown, then rounded to what it can take.
         checkpoint: path of its weights.
         sha256: of that file, in hexadecimal digits.
-        beside: the sweep, whose depths are taken where they are surer, and averaged where both agree.
     """
 
-    network: IterMVSConfig | EffiMVSConfig
-    magnification: float = number(low=0.01, high=16)
+    network: IterMVSConfig = field(default_factory=IterMVSConfig)
+    magnification: float = number(1.0, low=0.01, high=16)
     checkpoint: str | None
     sha256: str
-    beside: SweptConfig | None
 
 
 def grid_of(camera: Camera, magnification: float) -> Camera:
@@ -55,21 +51,20 @@ def grid_of(camera: Camera, magnification: float) -> Camera:
 
 def learned(config: LearnedConfig) -> Stereo:
     """Depth of RGB images by a network; the spread is -log of its confidence."""
-    module = effimvs if isinstance(config.network, EffiMVSConfig) else itermvs
-    network = load_network(config.checkpoint, config.sha256, module.SOURCE, "model", module.build_network)
+    network = load_network(config.checkpoint, config.sha256, itermvs.SOURCE, "model", itermvs.build_network)
 
     def prepare(image: np.ndarray, lens: Lens) -> Any:
         shown = rectify(np.float32(image), lens) / 255.0
         grid = grid_of(Camera(lens.focal, lens.center, *image.shape[1::-1]), config.magnification)
         way = cv2.INTER_AREA if grid.width < image.shape[1] else cv2.INTER_LINEAR
         resized = cv2.resize(shown, (grid.width, grid.height), interpolation=way)
-        return jitted(module.extract)(network, jnp.asarray(resized))
+        return jitted(itermvs.extract)(network, jnp.asarray(resized))
 
     def depth_of(
         view: Any, sources: Sources, depth_range: Float[Array, "2"], camera: Camera
     ) -> tuple[np.ndarray, np.ndarray]:
         grid, size = grid_of(camera, config.magnification), (camera.width, camera.height)
-        found = jitted(module.estimate)(network, view, sources, depth_range, grid, config.network)
+        found = jitted(itermvs.estimate)(network, view, sources, depth_range, grid, config.network)
         depth, confidence = map(np.asarray, found)
         inverse, confidence = (cv2.resize(values, size) for values in (1.0 / depth, confidence))
         return 1.0 / inverse, -np.log(confidence)

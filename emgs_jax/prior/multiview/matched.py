@@ -22,7 +22,7 @@ jitted_pixels = eqx.filter_jit(pixels_per_log_depth)
 NUM_KEPT = 64  # frames whose images or features are at hand
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MatchedConfig(DenseConfig):
     """Depth by matching a view with its sources.
 
@@ -31,8 +31,8 @@ class MatchedConfig(DenseConfig):
         best_parallax_rad: between the rays of a landmark, beyond which more is no better.
     """
 
-    num_sources: int = number(low=1, high=64)
-    best_parallax_rad: float = number(low=1e-6, high=4)
+    num_sources: int = number(6, low=1, high=64)
+    best_parallax_rad: float = number(0.2, low=1e-6, high=4)
 
 
 class Stereo(NamedTuple):

@@ -1,7 +1,7 @@
 """Depth of a network that looks at one image, or at a video, on the poses of a structure and at its scale."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from jaxtyping import Float
@@ -14,7 +14,7 @@ from emgs_jax.prior.multiview.landmarks import landmarks_of, point_information
 from emgs_jax.structure.model import Structure, scaled
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MonocularConfig(DenseConfig):
     """Depth that is brought to the scale of landmarks.
 
@@ -26,10 +26,11 @@ class MonocularConfig(DenseConfig):
         pixel_std: of a landmark, in pixels of the images that the structure was made of.
     """
 
-    fit: LandmarkFitConfig
+    fit: LandmarkFitConfig = field(default_factory=LandmarkFitConfig)
     kind: str = one_of(*KINDS)
-    cell: float = number(low=1e-3, high=1)
-    pixel_std: float = number(low=1e-3, high=100)
+    depth_margin: float = number(2.0, low=1, high=1000)
+    cell: float = number(0.1, low=1e-3, high=1)
+    pixel_std: float = number(1.0, low=1e-3, high=100)
 
 
 def begin_monocular(

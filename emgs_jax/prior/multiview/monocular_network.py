@@ -20,7 +20,7 @@ NUM_KEPT = 64  # frames whose depths are at hand
 jitted_predict = eqx.filter_jit(predict)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class MeterConfig(MonocularConfig):
     """Depth by METER.
 
@@ -30,8 +30,8 @@ class MeterConfig(MonocularConfig):
         sha256: of that file, in hexadecimal digits.
     """
 
-    width: int = number(low=64, high=4096)
-    height: int = number(low=64, high=4096)
+    width: int = number(256, low=64, high=4096)
+    height: int = number(192, low=64, high=4096)
     checkpoint: str | None
     sha256: str
 

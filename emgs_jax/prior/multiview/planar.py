@@ -34,15 +34,15 @@ class PlanarConfig:
         correlation: pixels; errors of matches that are nearer to each other are the same.
     """
 
-    max_contrast: float = number(low=0, high=1)
-    radius: int = number(low=1, high=64)
-    min_area: int = number(low=1)
-    max_spread: float = number(low=0)
-    min_matches: int = number(low=3)
-    tolerance: float = number(low=0)
-    min_share: float = number(low=0, high=1)
-    num_draws: int = number(low=1, high=1e6)
-    correlation: float = number(low=0)
+    max_contrast: float = number(0.03, low=0, high=1)
+    radius: int = number(1, low=1, high=64)
+    min_area: int = number(400, low=1)
+    max_spread: float = number(1.2, low=0)
+    min_matches: int = number(50, low=3)
+    tolerance: float = number(1.0, low=0)
+    min_share: float = number(0.75, low=0, high=1)
+    num_draws: int = number(64, low=1, high=1e6)
+    correlation: float = number(5.0, low=0)
 
 
 def blank_regions(gray: Float[np.ndarray, "h w"], config: PlanarConfig) -> Iterator[Bool[np.ndarray, "h w"]]:

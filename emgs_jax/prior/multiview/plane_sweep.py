@@ -22,12 +22,12 @@ class SweepConfig(eqx.Module):
         unseen_cost: of a plane that leads out of a source's image; a random match costs about .5.
     """
 
-    num_planes: int = static(low=2, high=4096)
-    num_best: int = static(low=1, high=64)
-    census_radius: int = static(low=1, high=32)
-    census_spacing: int = static(low=1, high=32)
-    census_margin: Float[Array, "*b"] = traced(low=0, high=1)
-    unseen_cost: Float[Array, "*b"] = traced(low=0)
+    num_planes: int = static(64, low=2, high=4096)
+    num_best: int = static(2, low=1, high=64)
+    census_radius: int = static(4, low=1, high=32)
+    census_spacing: int = static(2, low=1, high=32)
+    census_margin: Float[Array, "*b"] = traced(0.01, low=0, high=1)
+    unseen_cost: Float[Array, "*b"] = traced(0.5, low=0)
 
     def __check_init__(self) -> None:
         if len(_taps(self)) > 32:

@@ -1,8 +1,7 @@
 """The prior `multiview_stereo`: classical geometry from the images alone, without weights and without a GPU.
 
 COLMAP finds the poses of all images at once (`structure/`); a plane sweep against some of the other views the depth of
-each, and the matches on a blank region its plane (`swept.py`), or a network whose weights the user has (`learned.py`),
-or both: then the surest counts.
+each, and the matches on a blank region its plane (`swept.py`), or a network whose weights the user has (`learned.py`).
 Or the depths are those of a network that looks at one image at a time, in files, brought to the scale of COLMAP's
 landmarks (`depth_files.py`, `monocular.py`). The confidence of a depth is one over the standard deviation of log z
 (`depth_noise.py`), and 1 where nothing is known.
@@ -26,10 +25,10 @@ from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
-from emgs_jax.prior.multiview.dense import DenseConfig, Depths, Scene, Way
+from emgs_jax.prior.multiview.dense import DenseConfig, Scene, Way
 from emgs_jax.prior.multiview.depth import mean_difference
 from emgs_jax.prior.multiview.depth_files import DepthFilesConfig, way_of_files
-from emgs_jax.prior.multiview.depth_noise import relative_std, surest
+from emgs_jax.prior.multiview.depth_noise import relative_std
 from emgs_jax.prior.multiview.learned import LearnedConfig, learned
 from emgs_jax.prior.multiview.lens import Lens, as_shown, lens_of, points_shown
 from emgs_jax.prior.multiview.matched import begin_matched
@@ -55,15 +54,9 @@ def way_of(config: AnyDense) -> Way:
     return Way(partial(begin_matched, stereo=stereo, config=config))
 
 
-def in_order(config: AnyDense) -> tuple[AnyDense, ...]:
-    """A config, and that of the way whose depths are taken where they are surer."""
-    beside = config.beside if isinstance(config, LearnedConfig) else None
-    return (config,) if beside is None else (config, beside)
-
-
 def _described(config: AnyDense, way: Way) -> dict:
-    """Settings without paths, which digest or contents stand for, and without the way beside it."""
-    left_out = "folder", "checkpoint", "beside"
+    """Settings without paths, which digest or contents stand for."""
+    left_out = "folder", "checkpoint"
     return {key: value for key, value in _values(config).items() if key not in left_out} | dict(way.contents)
 
 
@@ -77,10 +70,8 @@ class MultiviewStereo(Prior):
     """Structure from motion of all images, and dense depth of each."""
 
     def __init__(self, structure: StructureConfig, dense: AnyDense) -> None:
-        self._config, self._ways = structure, [(config, way_of(config)) for config in in_order(dense)]
-        settings = {"structure": _values(structure), "dense": _described(*self._ways[0])}
-        if len(self._ways) > 1:
-            settings["dense"]["beside"] = _described(*self._ways[1])
+        self._config, self._dense, self._way = structure, dense, way_of(dense)
+        settings = {"structure": _values(structure), "dense": _described(dense, self._way)}
         self.provenance = Provenance("multiview_stereo", {"version": 13} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
@@ -101,8 +92,7 @@ class MultiviewStereo(Prior):
                 f"prior=multiview_stereo needs three images or more of one place, {dataset.name} {dataset.sequence} "
                 f"has {len(dataset)} in use: give more (dataset.stop, dataset.stride)"
             )
-        for _, way in self._ways:
-            way.check(dataset)
+        self._way.check(dataset)
         self._dataset = dataset
 
     def keep(self, folder: Path) -> None:
@@ -156,12 +146,8 @@ class MultiviewStereo(Prior):
             pinhole if is_straight else lens_of(world.camera, tuple(intrinsics), (width, height))
             for world in found.worlds
         ]
-        self._depths = []
-        for _, way in self._ways:
-            found, depths = way.begin(Scene(self._dataset, found, self._lenses, self._camera))
-            # What was made of a frame last is asked for again by its neighbours.
-            self._depths.append(lru_cache(NUM_KEPT)(depths))
-        self._found = found
+        self._found, depths = self._way.begin(Scene(self._dataset, found, self._lenses, self._camera))
+        self._depths = lru_cache(NUM_KEPT)(depths)  # what was made of a frame last is asked for again by its neighbours
 
     def _world_at(self, frame: int) -> int:
         """World of a frame; of one that none holds that of the last before which one does, so that nothing changes."""
@@ -171,24 +157,21 @@ class MultiviewStereo(Prior):
     def _answer(self, frame: int) -> DenseView:
         if not self._found.is_placed[frame]:
             return no_points((self._camera.width, self._camera.height))
-        lens, accepted = self._lenses[self._found.world[frame]], []
-        for depths, (config, _) in zip(self._depths, self._ways, strict=True):
-            std = self._std(frame, depths, config)
-            # What exceeds the noise that its own way accepts is none.
-            accepted.append((np.where(std <= config.noise.max_std, depths(frame).depth, 0.0), std))
-        depth, std = (as_shown(values, lens) for values in surest(*zip(*accepted, strict=True)))
+        lens, std = self._lenses[self._found.world[frame]], self._std(frame)
+        is_sure = np.isfinite(std) & (std <= self._dense.noise.max_std)
+        depth = np.float32(np.where(is_sure, self._depths(frame).depth, 0.0))
+        depth, std = (as_shown(values, lens) for values in (depth, np.where(depth > 0, std, np.float32(np.inf))))
         mask = depth > 0
         confidence = np.maximum(1.0 / np.where(mask, std, 1.0), np.float32(1.0))
         return points_shown(np.where(mask, depth, 0.0), lens), confidence, mask
 
     def _scale_std(self, frame: int) -> np.float64 | None:
-        """That of a frame's depths; the surest of two ways holds both."""
-        if not self._found.is_placed[frame]:
-            return None
-        return np.float64(min(depths(frame).scale_std for depths in self._depths))
+        """That of a frame's depths."""
+        return np.float64(self._depths(frame).scale_std) if self._found.is_placed[frame] else None
 
-    def _std(self, frame: int, depths: Depths, config: DenseConfig) -> np.ndarray:
+    def _std(self, frame: int) -> np.ndarray:
         """Standard deviation of the logarithm of each depth; inf where there is no telling."""
+        config, depths = self._dense, self._depths
         depth, spread, pixels, _ = depths(frame)
         others = placed_beside(self._found, frame)[: config.num_checks]
         if not others:

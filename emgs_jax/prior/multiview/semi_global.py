@@ -17,9 +17,9 @@ class SemiGlobalConfig(eqx.Module):
         edge: grey value difference, image in [0, 1], that halves the penalty of a larger change.
     """
 
-    small_step: Float[Array, "*b"] = traced(low=0)
-    large_step: Float[Array, "*b"] = traced(low=0)
-    edge: Float[Array, "*b"] = traced(low=1e-6)
+    small_step: Float[Array, "*b"] = traced(0.1, low=0)
+    large_step: Float[Array, "*b"] = traced(1.0, low=0)
+    edge: Float[Array, "*b"] = traced(0.03, low=1e-6)
 
 
 def _advance(path: Array, cost: Array, large_step: Array, config: SemiGlobalConfig) -> Array:

@@ -1,6 +1,6 @@
 """Dense depth without weights: plane sweep, semi-global aggregation, and planes where texture is missing."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import cv2
 import equinox as eqx
@@ -18,12 +18,12 @@ from emgs_jax.prior.sources import Sources
 jitted_depth = eqx.filter_jit(estimate_depth)
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class SweptConfig(MatchedConfig):
     """Depth by a plane sweep, and blank regions that become planes."""
 
-    depth: DepthConfig
-    planar: PlanarConfig
+    depth: DepthConfig = field(default_factory=DepthConfig)
+    planar: PlanarConfig = field(default_factory=PlanarConfig)
 
 
 def swept(config: SweptConfig) -> Stereo:

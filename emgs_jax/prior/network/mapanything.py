@@ -1,13 +1,7 @@
-"""The networks of the MapAnything framework as a prior.
+"""MapAnything as a prior.
 
-*Frame.* A network expresses everything in the frame of its first view, which is the anchor, but that view's own pose is
-only approximately the identity. So poses are given out as inv(T_0) T_i, and points stay in their own camera.
-
-*Scale.* A network whose scale is `arbitrary` uses a new unit in every call. What all calls share is the anchor's image,
-so the unit is defined there: a prediction is scaled such that the median depth of the anchor's usable pixels is
-`anchor_depth_m`. Consecutive windows then agree, nothing accumulates along the sequence, and a prediction depends on
-its window alone, so that an interrupted recording can be continued. The result as a whole is up to one global scale.
-Where the anchor has no usable pixel there is no scale: the mask is off and the poses are NaN.
+*Frame.* The network expresses everything in the frame of its first view, which is the anchor, but that view's own pose
+is only approximately the identity. So poses are given out as inv(T_0) T_i, and points stay in their own camera.
 
 *Grid.* Predictions are made on the network's grid and handed out at the frames' pixels, see `resize.at_pixels`. Where
 the data set's `size` is the grid, nothing is resampled.
@@ -34,7 +28,7 @@ from emgs_jax.prior.base import (
     relative_poses,
 )
 from emgs_jax.prior.network.framework import (
-    MODELS,
+    PATCH,
     ComputeConfig,
     Network,
     NoAnswerError,
@@ -42,61 +36,46 @@ from emgs_jax.prior.network.framework import (
     build_views,
     read_output,
 )
-from emgs_jax.prior.network.masks import MaskConfig, consistent, usable
+from emgs_jax.prior.network.masks import MaskConfig, usable
 from emgs_jax.prior.network.resize import Resize, Size, at_pixels, choose_grid, on_grid_of, plan_resize, resize_image
 from emgs_jax.prior.network.torch_network import load_network
 
 
 class MapAnything(Prior):
-    """A prior that asks a network of the framework.
+    """A prior that asks MapAnything.
 
     Args:
-        model: name in `framework.MODELS`.
-        checkpoint: folder with config.json and model.safetensors, for `mapanything`.
+        checkpoint: folder with config.json and model.safetensors.
         resolution: (width, height) of the network's grid; None = the framework's choice for the frames' aspect.
         anchor_pose: give the anchor a pose, as the paper does; its value has no influence, that it is there has.
         anchor_is_metric: call that pose metric; the paper does not say.
-        anchor_depth_m: median depth of the anchor, for networks of arbitrary scale.
         max_depth_step: relative depth difference across which nothing is interpolated.
         load: makes the network; tests put another one here.
     """
 
     def __init__(
         self,
-        model: str,
         checkpoint: Path | str | None,
         resolution: Sequence[int] | None,
         anchor_pose: bool | str,
         anchor_is_metric: bool,
-        anchor_depth_m: float,
         max_depth_step: float,
         compute: ComputeConfig,
         masks: MaskConfig,
-        load: Callable[[str, Path | None, ComputeConfig], Network] = load_network,
+        load: Callable[[Path | None, ComputeConfig], Network] = load_network,
     ) -> None:
-        _check_keys(model, resolution, anchor_pose, anchor_depth_m)
-        self._model, self._masks, self._max_depth_step = MODELS[model], masks, float(max_depth_step)
+        _check_keys(resolution, anchor_pose)
+        self._masks, self._max_depth_step = masks, float(max_depth_step)
         self._resolution = None if resolution is None else (int(resolution[0]), int(resolution[1]))
-        has_pose = self._model.is_conditioned and anchor_pose in (True, "on")
-        self._anchor_is_metric = bool(anchor_is_metric) if has_pose else None
-        self._anchor_depth_m = float(anchor_depth_m) if self._model.scale == "arbitrary" else None
-        if checkpoint is not None and not self._model.is_conditioned:
-            raise ValueError(
-                f"prior.checkpoint is for prior.model=mapanything; {model} reads its weights from the caches"
-            )
-        folder = None if checkpoint is None else Path(checkpoint).expanduser()
-        self._network = load(model, folder, compute)
+        self._anchor_is_metric = bool(anchor_is_metric) if anchor_pose in (True, "on") else None
+        self._network = load(None if checkpoint is None else Path(checkpoint).expanduser(), compute)
         self._seconds: list[float] = []
-        self.provenance = Provenance("mapanything", self._settings(model, compute) | self._network.described)
+        self.provenance = Provenance("mapanything", self._settings(compute) | self._network.described)
 
-    def _settings(self, model: str, compute: ComputeConfig) -> dict[str, Any]:
+    def _settings(self, compute: ComputeConfig) -> dict[str, Any]:
         """Return what decides the predictions, as it took effect."""
         return {
-            "version": 1,
-            "model": model,
-            "scale": self._model.scale,
-            "anchor_depth_m": self._anchor_depth_m,
-            "is_calibrated": self._model.is_conditioned,
+            "version": 2,
             "anchor_pose": self._anchor_is_metric is not None,
             "anchor_is_metric": self._anchor_is_metric,
             "resolution": self._resolution,
@@ -118,14 +97,14 @@ class MapAnything(Prior):
         }
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Predict for `frames` (in the order of `window.views`); see the module for frame, scale and grid.
+        """Predict for `frames` (in the order of `window.views`); see the module for frame and grid.
 
         Where the network has no answer no pixel is valid and all poses but the anchor's are NaN.
         """
         size = check_frames(window, frames)
-        resize = plan_resize(size, self._resolution or choose_grid(size, self._model.resolution_set))
+        resize = plan_resize(size, self._resolution or choose_grid(size))
         images = [resize_image(frame.image, resize) for frame in frames]
-        views = build_views(images, intrinsics, resize, self._model, self._anchor_is_metric)
+        views = build_views(images, intrinsics, resize, self._anchor_is_metric)
         begin = perf_counter()
         try:
             answers = self._network.infer(views)
@@ -135,47 +114,27 @@ class MapAnything(Prior):
             return predicted(window, T_anchor_view, [no_points(size)] * len(window.dense))
         self._seconds.append(perf_counter() - begin)
         outputs = [read_output(answer, resize.grid) for answer in answers]
-        dense = [window.views.index(index) for index in window.dense]
-        is_compared = self._masks.min_consistent_share > 0
-        outputs, valid = self._scaled(outputs, {*range(len(outputs))} if is_compared else {0, *dense})
         T_anchor_view = relative_poses([output.T_reference_view for output in outputs])
-        if is_compared:
-            depths = np.stack([np.where(valid[row], view.points[..., 2], 0) for row, view in enumerate(outputs)])
-            seen = depths, np.stack([view.intrinsics for view in outputs]), T_anchor_view
-            valid = {row: valid[row] & consistent(row, *seen, self._masks) for row in dense}
-        return predicted(window, T_anchor_view, [self._at_frame(outputs[row], valid[row], resize) for row in dense])
+        dense = [outputs[window.views.index(index)] for index in window.dense]
+        return predicted(window, T_anchor_view, [self._at_frame(output, resize) for output in dense])
 
-    def _scaled(self, outputs: list[ViewOutput], needed: set[int]) -> tuple[list[ViewOutput], dict[int, np.ndarray]]:
-        """Return the outputs in metres, and the masks of the views that are needed; none where there is no scale."""
-        views = {row: outputs[row] for row in needed}
-        valid = {row: usable(view.points, view.confidence, view.is_clear, self._masks) for row, view in views.items()}
-        if self._anchor_depth_m is None:
-            return outputs, valid
-        depths = outputs[0].points[..., 2][valid[0]]
-        scale = self._anchor_depth_m / float(np.median(depths)) if depths.size else np.nan
-        return [view.times(scale) for view in outputs], {row: mask & (depths.size > 0) for row, mask in valid.items()}
-
-    def _at_frame(self, view: ViewOutput, on: np.ndarray, resize: Resize) -> DenseView:
+    def _at_frame(self, view: ViewOutput, resize: Resize) -> DenseView:
+        on = usable(view.points, view.confidence, view.is_clear, self._masks)
         points = np.where(on[..., None], view.points, 0).astype(np.float32)
         confidence = np.where(on, np.maximum(view.confidence, 1), 1).astype(np.float32)
         pixels = on_grid_of(resize.frame, resize.scaled, resize.corner)
         return at_pixels(points, confidence, on, pixels, self._max_depth_step)
 
 
-def _check_keys(model: str, resolution: Sequence[int] | None, anchor_pose: bool | str, anchor_depth_m: float) -> None:
+def _check_keys(resolution: Sequence[int] | None, anchor_pose: bool | str) -> None:
     """Raise ValueError naming the key that has no sense."""
-    if model not in MODELS:
-        raise ValueError(f"prior.model must be one of {', '.join(MODELS)}; got {model!r}")
-    patch = MODELS[model].patch
-    if resolution is not None and (len(resolution) != 2 or any(side < patch or side % patch for side in resolution)):
+    if resolution is not None and (len(resolution) != 2 or any(side < PATCH or side % PATCH for side in resolution)):
         raise ValueError(
-            f"prior.resolution must be (width, height) in multiples of {patch}, or null for the framework's own choice;"
+            f"prior.resolution must be (width, height) in multiples of {PATCH}, or null for the framework's own choice;"
             f" got {list(resolution)}"
         )
     if anchor_pose not in (True, False, "on", "off"):
         raise ValueError(f"prior.anchor_pose must be on or off, got {anchor_pose!r}")
-    if not anchor_depth_m > 0:
-        raise ValueError(f"prior.anchor_depth_m must be above 0 m, got {anchor_depth_m}")
 
 
 def check_frames(window: Window, frames: Sequence[Frame]) -> Size:

@@ -1,7 +1,7 @@
 """Masks of the usable pixels of a network's output: MapAnything's criteria, on the network's grid.
 
-A pixel is left out where the network calls it ambiguous, where its confidence is among the lowest of its view, on
-edges, and where other views of the window contradict its depth. Every part has a neutral value that turns it off.
+A pixel is left out where the network calls it ambiguous, where its confidence is among the lowest of its view, and on
+edges. Every part has a neutral value that turns it off.
 Upstream's own functions miss edges where rounding makes a cosine larger than 1.
 """
 
@@ -13,7 +13,6 @@ import cv2
 import numpy as np
 from jaxtyping import Bool, Float
 
-from emgs_jax.ops.camera import NEAREST_DEPTH
 from emgs_jax.ops.ranges import number
 
 SQUARE = np.ones((3, 3), np.uint8)
@@ -29,18 +28,12 @@ class MaskConfig:
         max_edge_step: depth range over 3 × 3 pixels, relative to the depth, above which there is a depth edge.
         max_edge_degrees: angle between neighbouring normals above which there is a normal edge. A pixel is left out
             where both edges are; inf in either keeps all.
-        min_consistent_share: of the views that see the point, share that must have its depth; 0 = not tested.
-        consistent_depth_m: two depths agree within this and
-        consistent_depth_share: this fraction of the depth.
     """
 
-    drop_ambiguous: float = number(low=0, high=1)
-    confidence_percentile: float = number(low=0, high=100)
-    max_edge_step: float = number(low=0, high=math.inf)
-    max_edge_degrees: float = number(low=0, high=math.inf)
-    min_consistent_share: float = number(low=0, high=1)
-    consistent_depth_m: float = number(low=0, high=math.inf)
-    consistent_depth_share: float = number(low=0, high=math.inf)
+    drop_ambiguous: float = number(1.0, low=0, high=1)
+    confidence_percentile: float = number(0.0, low=0, high=100)
+    max_edge_step: float = number(0.03, low=0, high=math.inf)
+    max_edge_degrees: float = number(5.0, low=0, high=math.inf)
 
 
 def usable(
@@ -120,39 +113,3 @@ def depth_edges(
     """Mark valid pixels whose valid 3 × 3 neighbours range in depth over more than `max_step` of the pixel's own."""
     highest, lowest = (sign * cv2.dilate(np.where(valid, sign * depth, -np.inf), SQUARE) for sign in (1, -1))
     return valid & (np.subtract(highest, lowest, out=np.zeros_like(highest), where=valid) > max_step * depth)
-
-
-def consistent(
-    row: int,
-    depths: Float[np.ndarray, "v h w"],
-    intrinsics: Float[np.ndarray, "v 3 3"],
-    T_anchor_view: Float[np.ndarray, "v 4 4"],
-    config: MaskConfig,
-) -> Bool[np.ndarray, "h w"]:
-    """Mark the pixels of view `row` whose depth enough of the other views that see the point have at the nearest pixel.
-
-    A pixel that no other view sees is not contradicted.
-
-    Args:
-        depths: camera-space z in metres of all views; 0 where there is none.
-        intrinsics: of all views, pixel centres at integers.
-        T_anchor_view: camera -> any common frame.
-    """
-    height, width = depths.shape[1:]
-    v, u = np.indices((height, width))
-    points = depths[row][..., None] * (np.stack([u, v, np.ones_like(u)], axis=-1) @ np.linalg.inv(intrinsics[row]).T)
-    num_seen, num_agreed = np.zeros((2, height, width), int)
-    for other in set(range(len(depths))) - {row}:
-        T = np.linalg.inv(T_anchor_view[other]) @ T_anchor_view[row]
-        moved = points @ T[:3, :3].T + T[:3, 3]
-        expected = moved[..., 2]
-        sees = (expected > NEAREST_DEPTH) & (depths[row] > 0)
-        pixels = (moved / np.where(sees, expected, 1)[..., None]) @ intrinsics[other].T
-        x, y = pixels[..., 0], pixels[..., 1]
-        sees &= (x >= 0) & (x <= width - 1) & (y >= 0) & (y <= height - 1)
-        found = depths[other][tuple(np.rint(np.where(sees, c, 0)).astype(int) for c in (y, x))]
-        sees &= found > 0
-        num_seen += sees
-        tolerance = config.consistent_depth_m + config.consistent_depth_share * expected
-        num_agreed += sees & (np.abs(expected - found) < tolerance)
-    return num_agreed >= config.min_consistent_share * num_seen

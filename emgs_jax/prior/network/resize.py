@@ -16,11 +16,7 @@ from PIL import Image
 
 Size = tuple[int, int]
 
-HEIGHTS = {  # resolution set, which is the longer side -> the shorter sides of its grids; upstream's `fixed_mapping`
-    518: (168, 252, 294, 336, 392, 518),
-    512: (160, 256, 288, 336, 384, 512),
-    504: (154, 238, 280, 322, 378, 504),
-}
+LONGER, SHORTER = 518, (168, 252, 294, 336, 392, 518)  # sides of the network's grids; upstream's `fixed_mapping`
 
 
 @dataclass(frozen=True)
@@ -41,9 +37,9 @@ class Resize:
     scale: float
 
 
-def choose_grid(frame: Size, resolution_set: int) -> Size:
-    """The grid of a set whose aspect is nearest to that of the frames; all but the widest are there upright, too."""
-    wide = [(resolution_set, height) for height in HEIGHTS[resolution_set]]
+def choose_grid(frame: Size) -> Size:
+    """The grid whose aspect is nearest to that of the frames; all but the widest are there upright, too."""
+    wide = [(LONGER, height) for height in SHORTER]
     grids = [*wide, *((height, width) for width, height in wide[1:])]
     return min(grids, key=lambda grid: abs(round(grid[0] / grid[1], 3) - frame[0] / frame[1]))  # as upstream's table
 

@@ -1,4 +1,4 @@
-"""Networks of the MapAnything framework in torch: arrays in, arrays out, in the precision that was asked for.
+"""MapAnything in torch: arrays in, arrays out, in the precision that was asked for.
 
 Nothing is downloaded, and no parameter keeps a random value. torch and the framework are imported in functions. What
 fails is one message with the file or package and the remedy.
@@ -8,7 +8,6 @@ import contextlib
 import hashlib
 import importlib
 import os
-import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
@@ -18,10 +17,9 @@ from typing import Any
 import numpy as np
 
 from emgs_jax.features.checkpoint import BACKBONE, digest
-from emgs_jax.io.packages import best_device, companion_problem, first_line
+from emgs_jax.io.packages import best_device, companion_problem
 from emgs_jax.prior.network.framework import (
     DOWNLOAD,
-    MODELS,
     USED_OUTPUTS,
     ComputeConfig,
     Network,
@@ -29,8 +27,6 @@ from emgs_jax.prior.network.framework import (
     View,
     check_checkpoint,
 )
-
-CLONE = "the clone of facebookresearch/map-anything"
 
 
 def import_framework(name: str) -> ModuleType:
@@ -61,53 +57,6 @@ def pretrained(folder: Path) -> Any:
         raise ValueError(
             f"{folder / 'model.safetensors'} is damaged or no MapAnything's ({said}): repeat {DOWNLOAD}"
         ) from error
-
-
-def configured(torch: ModuleType, name: str, device: str) -> Any:
-    """A network that the framework composes from its own configuration, whose files must be in the caches already."""
-    from hydra.core.global_hydra import GlobalHydra
-
-    models, known = import_framework("mapanything.models"), MODELS[name]
-    outer = GlobalHydra.instance().hydra  # the framework composes with Hydra too and would leave its own behind
-    try:
-        with whole_weights(torch):
-            return models.init_model_from_config(name, device=device).eval()
-    except torch.cuda.OutOfMemoryError:
-        raise
-    except ImportError as error:
-        install = f"in {CLONE}, pip install -e '.{f'[{known.extra}]' if known.extra else ''}'"
-        raise ValueError(f"prior.model={name} needs more ({error}): {companion_problem() or install}") from error
-    except Exception as error:  # each format of weights has its own types of errors
-        raise ValueError(
-            f"prior.model={name} cannot be made ({first_line(error)}). Nothing is downloaded at run time: its weights "
-            f"({known.weights}) must be whole in the local caches (HF_HOME, TORCH_HOME), or where "
-            f"root_pretrained_checkpoints_dir in configs/machine/default.yaml in {CLONE} says"
-        ) from error
-    finally:
-        GlobalHydra.instance().hydra = outer
-
-
-@contextlib.contextmanager
-def whole_weights(torch: ModuleType) -> Iterator[None]:
-    """Refuse weights that leave a parameter as it was drawn: some wrappers load without being strict."""
-    module = torch.nn.Module
-    load = module.load_state_dict
-
-    def load_whole(self: Any, state: Any, strict: bool = True, assign: bool = False) -> Any:
-        result, tensors = load(self, state, strict, assign), self.state_dict()
-        loaded = {tensor.data_ptr() for name, tensor in tensors.items() if name in state}  # of two names files have one
-        missing = [
-            name for name in result.missing_keys if name not in tensors or tensors[name].data_ptr() not in loaded
-        ]
-        if missing:
-            raise ValueError(f"{type(self).__name__} lacks {len(missing)} of its weights, {', '.join(missing[:3])}, …")
-        return result
-
-    module.load_state_dict = load_whole
-    try:
-        yield
-    finally:
-        module.load_state_dict = load
 
 
 @contextlib.contextmanager
@@ -169,8 +118,7 @@ class TorchNetwork:
         """
         torch = import_framework("torch")
         height, width = views[0]["img"].shape[2:]
-        # Some networks end in an optimisation by gradients, which no_grad lets them switch on again.
-        with _memory_error(torch, f"{len(views)} images of {width}x{height}"), torch.no_grad(), _same_draws(torch):
+        with _memory_error(torch, f"{len(views)} images of {width}x{height}"), torch.no_grad():
             try:
                 outputs = self._call([{key: self._tensor(torch, value) for key, value in v.items()} for v in views])
             except torch.linalg.LinAlgError as error:
@@ -192,74 +140,28 @@ def _array(value: Any) -> Any:
     return (value.float() if value.is_floating_point() else value).numpy()
 
 
-def load_network(name: str, checkpoint: Path | None, compute: ComputeConfig) -> Network:
-    """Load a network from local files; ValueError naming what is not installed, missing or set wrongly.
-
-    Args:
-        name: key of `MODELS`.
-        checkpoint: folder of the weights, of `mapanything` only.
-    """
-    torch, model = import_framework("torch"), MODELS[name]
+def load_network(checkpoint: Path | None, compute: ComputeConfig) -> Network:
+    """Load MapAnything from a local folder; ValueError naming what is not installed, missing or set wrongly."""
+    torch = import_framework("torch")
     import_framework("torch.hub")
-    device = compute.device or best_device(torch, f"prior.model={name}", "prior.compute.device")
+    device = compute.device or best_device(torch, "prior=mapanything", "prior.compute.device")
     if device.startswith("cuda") and not torch.cuda.is_available():
         raise ValueError(f"prior.compute.device={device}, but torch {torch.__version__} finds no GPU: use cpu or null")
-    if model.needs_gpu and not device.startswith("cuda"):
-        raise ValueError(f"prior.model={name} cannot be built without a GPU: use prior.model=mapanything")
-    amp = compute.amp if device.startswith("cuda") and model.precision else "float32"
-    described = {"device": device.partition(":")[0], "amp": amp}
+    amp = compute.amp if device.startswith("cuda") else "float32"
     torch.backends.cudnn.benchmark, torch.backends.cudnn.deterministic = False, True
-    with offline(torch), _memory_error(torch, f"the weights of {name}"):
-        if model.is_conditioned:
-            check_checkpoint(checkpoint, Path(torch.hub.get_dir()))
-            digests = "".join(digest(checkpoint / name) for name in BACKBONE)
-            described["checkpoint_sha256"] = hashlib.sha256(digests.encode()).hexdigest()
-            call = partial(
-                pretrained(checkpoint).to(device).eval().infer,
-                memory_efficient_inference=compute.memory_efficient,
-                minibatch_size=compute.minibatch_size,
-                use_amp=amp != "float32",
-                amp_dtype="fp16" if amp == "fp16" else "bf16",
-                apply_mask=False,  # upstream masks every view; masks.py does it for those in use
-            )
-        else:
-            network = configured(torch, name, device)
-            _set_precision(torch, network, name, amp)
-            call = _plain_call(network)
-    return TorchNetwork(call, device, described)
-
-
-def _set_precision(torch: ModuleType, model: Any, name: str, amp: str) -> None:
-    """Put the precision where the framework's wrapper keeps its own choice, so that the provenance says what ran."""
-    attribute = MODELS[name].precision
-    if not attribute:
-        return
-    if not hasattr(model, attribute):
-        raise ValueError(f"prior.model={name} keeps no .{attribute}: this version of mapanything is not supported")
-    dtypes = {"bf16": torch.bfloat16, "fp16": torch.float16, "float32": torch.float32}
-    names = {"bf16": "bf16", "fp16": "fp16", "float32": False}
-    setattr(model, attribute, (dtypes if attribute == "dtype" else names)[amp])
-
-
-def _plain_call(model: Any) -> Call:
-    postprocess = import_framework("mapanything.utils.inference").postprocess_model_outputs_for_inference
-
-    def call(views: list[View]) -> list[View]:
-        with tempfile.TemporaryDirectory() as folder:
-            if hasattr(model, "cache_dir"):  # MASt3R would take what it finds there under a view's name for the view's
-                model.cache_dir = folder
-            raw = model(views)
-        return postprocess(raw, views, apply_mask=False)
-
-    return call
-
-
-@contextlib.contextmanager
-def _same_draws(torch: ModuleType) -> Iterator[None]:
-    """Let every call draw the same random numbers: the same question gets the same answer."""
-    with torch.random.fork_rng():
-        torch.manual_seed(0)
-        yield
+    with offline(torch), _memory_error(torch, "the weights"):
+        check_checkpoint(checkpoint, Path(torch.hub.get_dir()))
+        digests = "".join(digest(checkpoint / name) for name in BACKBONE)
+        call = partial(
+            pretrained(checkpoint).to(device).eval().infer,
+            memory_efficient_inference=compute.memory_efficient,
+            minibatch_size=compute.minibatch_size,
+            use_amp=amp != "float32",
+            amp_dtype="fp16" if amp == "fp16" else "bf16",
+            apply_mask=False,  # upstream masks every view; masks.py does it for those in use
+        )
+    sha256 = hashlib.sha256(digests.encode()).hexdigest()
+    return TorchNetwork(call, device, {"device": device.partition(":")[0], "amp": amp, "checkpoint_sha256": sha256})
 
 
 @contextlib.contextmanager

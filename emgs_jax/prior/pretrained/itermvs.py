@@ -7,7 +7,9 @@ GRU sees how well depths around the present one fit, at three scales, and says a
 from 0 (farthest) to 1 (nearest), linear in 1/z, so the unit of poses and range does not matter.
 """
 
-from typing import Any
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -18,22 +20,11 @@ from emgs_jax.ops.camera import Camera, downscale, pixel_grid, rays
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static
 from emgs_jax.ops.ranges import ranged
-from emgs_jax.prior.pretrained.layers import chain, convolve, resize
-from emgs_jax.prior.pretrained.matching import (
-    COARSEST,
-    FINEST,
-    MIDDLE,
-    Features,
-    correlation,
-    inverse_between,
-    pyramid,
-    seen_from,
-    turn,
-    upsample,
-)
+from emgs_jax.prior.pretrained.layers import Conv, chain, convolve, resize, sample
 from emgs_jax.prior.pretrained.weights import Layers, Tensors, layers, read_layers
 from emgs_jax.prior.sources import Sources
 
+FINEST, MIDDLE, COARSEST = 2, 4, 8  # pixels of the image to one of the features
 UPDATE, EVALUATION = "iter_mvs.update", "iter_mvs.evaluation"
 MATCHING = {"conv0.conv": {}, "conv1.conv": {"stride": 2}, "conv2.conv": {"stride": 2}}
 MATCHING |= {"conv3": {"expansion": 2}, "conv4": {"expansion": 2}, "conv5": {}}
@@ -41,8 +32,8 @@ HEADS = {"hidden_init_head": (0, 2), "depth_head": (0, 2, 4), "confidence_head":
 SOURCE = "https://github.com/FangjinhuaWang/IterMVS (MIT), checkpoints/blendedmvs/model_000015.ckpt"
 
 
-def _steps() -> Any:
-    return eqx.field(static=True, converter=tuple, metadata=ranged(-256, 256))
+def _steps(*default: float) -> Any:
+    return eqx.field(default=default, static=True, converter=tuple, metadata=ranged(-256, 256))
 
 
 class IterMVSConfig(eqx.Module):
@@ -57,13 +48,75 @@ class IterMVSConfig(eqx.Module):
             of a scale, in 1/256 of the range.
     """
 
-    num_iterations: int = static(low=1, high=64)
-    num_groups: int = static(low=1, high=16)
-    num_initial: int = static(low=2, high=256)
-    window: int = static(low=0, high=128)
-    finest_steps: tuple[float, ...] = _steps()
-    middle_steps: tuple[float, ...] = _steps()
-    coarsest_steps: tuple[float, ...] = _steps()
+    num_iterations: int = static(4, low=1, high=64)
+    num_groups: int = static(8, low=1, high=16)
+    num_initial: int = static(32, low=2, high=256)
+    window: int = static(4, low=0, high=128)
+    finest_steps: tuple[float, ...] = _steps(-2.0, -0.6666667, 0.6666667, 2.0)
+    middle_steps: tuple[float, ...] = _steps(-8.0, -2.6666667, 2.6666667, 8.0)
+    coarsest_steps: tuple[float, ...] = _steps(-32.0, 32.0)
+
+
+class Features(NamedTuple):
+    """Of one image, at 1/2, 1/4 and 1/8 of its size."""
+
+    finest: Float[Array, "*b h2 w2 c2"]
+    middle: Float[Array, "*b h4 w4 c4"]
+    coarsest: Float[Array, "*b h8 w8 c8"]
+
+
+def inverse_between(unit: Array, depth_range: Float[Array, "2"]) -> Array:
+    """0 (farthest) to 1 (nearest) -> 1/z."""
+    near, far = 1.0 / depth_range[0], 1.0 / depth_range[1]
+    return far + unit * (near - far)
+
+
+def seen_from(points: Float[Array, "*b 3"], source: Sources) -> Float[Array, "*b 3"]:
+    """Points of the reference camera in that of a source."""
+    return points @ source.T_source_view.rotation().as_matrix().T + source.T_source_view.translation()
+
+
+def correlation(
+    reference: Float[Array, "h w c"],
+    source: Float[Array, "h2 w2 c"],
+    points: Float[Array, "n h w 3"],
+    camera: Camera,
+    num_groups: int,
+) -> Float[Array, "n h w g"]:
+    """Mean product of the channels of each group, where the source shows the points; zero where it does not.
+
+    Args:
+        reference: features of the pixels whose points they are.
+        source: features of the other view.
+        points: in its camera.
+        camera: of its features.
+    """
+    is_ahead = points[..., 2] > 0
+    pixels = camera.focal * points[..., :2] / jnp.where(is_ahead, points[..., 2], 1.0)[..., None] + camera.center
+    product = sample(source, pixels, is_ahead) * reference
+    return jnp.mean(product.reshape(*product.shape[:-1], num_groups, -1), axis=-1)
+
+
+def upsample(values: Float[Array, "h w"], logits: Float[Array, "h w k"]) -> Float[Array, "h2 w2"]:
+    """Each of r×r pixels is a convex combination of nine values around it (Teed and Deng, ECCV 2020).
+
+    Args:
+        values: one for each block of r×r pixels.
+        logits: of the combinations, k = 9 r².
+    """
+    (height, width), ratio = values.shape, math.isqrt(logits.shape[-1] // 9)
+    padded = jnp.pad(values, 1, mode="edge")
+    around = jnp.stack([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], axis=-1)
+    weights = jax.nn.softmax(logits.reshape(height, width, 9, ratio, ratio), axis=2)
+    return jnp.einsum("hwk,hwkyx->hywx", around, weights).reshape(ratio * height, ratio * width)
+
+
+def turn(hidden: Float[Array, "h w c"], seen: Float[Array, "h w i"], gates: Sequence[Conv]) -> Float[Array, "h w c"]:
+    """One step of a convolutional gated recurrent unit: the update's gate, the reset's, and the candidate."""
+    both = jnp.concatenate([hidden, seen], axis=-1)
+    update, reset = (jax.nn.sigmoid(convolve(both, gate)) for gate in gates[:2])
+    candidate = jnp.tanh(convolve(jnp.concatenate([reset * hidden, seen], axis=-1), gates[2]))
+    return (1.0 - update) * hidden + update * candidate
 
 
 def _double(image: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:
@@ -81,8 +134,11 @@ def extract(network: Layers, image: Float[Array, "h w 3"]) -> Features:
             kept = convolve(image, network[f"{name}.downsample"]) if block == 0 else image
             image = jax.nn.relu(chain(image, layers(network, name, ("conv1", "conv2"))) + kept)
         scales.append(image)
-    lateral, out = (("inner2", "inner1"), ("output1", "output2", "output3"))
-    return pyramid(scales, *(layers(network, "feature_net", names) for names in (lateral, out)), _double)
+    half, quarter, eighth = scales
+    middle = _double(eighth) + convolve(quarter, network["feature_net.inner2"])
+    finest = _double(middle) + convolve(half, network["feature_net.inner1"])
+    last = layers(network, "feature_net", ("output1", "output2", "output3"))
+    return Features(*(convolve(image, conv) for image, conv in zip((finest, middle, eighth), last, strict=True)))
 
 
 def _match(network: Layers, scale: int, correlation: Float[Array, "n h w g"]) -> Float[Array, "h w n"]:
@@ -204,7 +260,7 @@ def estimate(
 
     unit = _regress(chain(hidden, to_depth), config.window)
     (hidden, unit), _ = jax.lax.scan(iterate, (hidden, unit), length=config.num_iterations)
-    unit = upsample(unit, chain(reference.middle, layers(network, "iter_mvs.upsample", (0, 2))), "edge")
+    unit = upsample(unit, chain(reference.middle, layers(network, "iter_mvs.upsample", (0, 2))))
     depth = 1.0 / inverse_between(unit, depth_range)
     confidence = jax.nn.sigmoid(chain(hidden, to_confidence))
     return depth, resize(confidence, depth.shape)[..., 0]

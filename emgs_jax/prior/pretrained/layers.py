@@ -1,14 +1,10 @@
-"""Layers of convolutional networks as functions of (height, width, channels), as their weights were trained.
-
-A volume has its depth before: (depth, height, width, channels).
-"""
+"""Layers of convolutional networks as functions of (height, width, channels), as their weights were trained."""
 
 from collections.abc import Sequence
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from emgs_jax.ops.pytree import static
@@ -18,64 +14,50 @@ class Conv(eqx.Module):
     """A convolution whose result is as large as the image, divided by `stride` or multiplied by `expansion`.
 
     Args:
-        weight: rows, columns, channels of the input (one, where each channel is by itself), channels of the output;
-            of volumes with depth before.
+        weight: rows, columns, channels of the input (one, where each channel is by itself), channels of the output.
         bias: of each channel of the output.
-        stride: of the result's pixels on the image, along every axis or each.
+        stride: of the result's pixels on the image.
         dilation: pixels between those that are weighed.
-        expansion: of the image before: the transposed convolution with that stride, 2 of three weights.
+        expansion: of the image before: 2 is the transposed convolution of three weights with that stride.
     """
 
-    weight: Float[Array, "*k i o"]
+    weight: Float[Array, "y x i o"]
     bias: Float[Array, "o"]
-    stride: int | tuple[int, ...] = static()
+    stride: int = static()
     dilation: int = static()
-    expansion: int | tuple[int, ...] = static()
+    expansion: int = static()
 
 
 def convolve(image: Float[Array, "*b i"], conv: Conv) -> Float[Array, "*b2 o"]:
     """Apply a convolution; beyond the image there is zero."""
-    axes = conv.weight.ndim - 2
-    stride, expansion = (tuple(np.broadcast_to(step, axes).tolist()) for step in (conv.stride, conv.expansion))
-    reach = [conv.dilation * (size // 2) for size in conv.weight.shape[:axes]]
-    letters = "DHW"[-axes:]
+    reach = [conv.dilation * (size // 2) for size in conv.weight.shape[:2]]
     found = jax.lax.conv_general_dilated(
-        image.reshape(-1, *image.shape[-axes - 1 :]),
-        _of_phases(conv.weight, expansion),
-        stride,
-        [(r * (step == 1), r) for r, step in zip(reach, expansion, strict=True)],
-        rhs_dilation=(conv.dilation,) * axes,
-        dimension_numbers=(f"N{letters}C", f"{letters}IO", f"N{letters}C"),
+        image.reshape(-1, *image.shape[-3:]),
+        _of_phases(conv.weight) if conv.expansion == 2 else conv.weight,
+        (conv.stride, conv.stride),
+        [(r * (conv.expansion == 1), r) for r in reach],
+        rhs_dilation=(conv.dilation, conv.dilation),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
         feature_group_count=image.shape[-1] // conv.weight.shape[-2],
     )
-    found = _interleaved(found, expansion)
-    return found.reshape(*image.shape[: -axes - 1], *found.shape[1:]) + conv.bias
+    if conv.expansion == 2:
+        n, height, width, channels = found.shape
+        phases = found.reshape(n, height, width, channels // 4, 2, 2).transpose(0, 1, 4, 2, 5, 3)
+        found = phases.reshape(n, 2 * height, 2 * width, channels // 4)
+    return found.reshape(*image.shape[:-3], *found.shape[1:]) + conv.bias
 
 
-def _of_phases(weight: Float[Array, "*k i o"], expansion: tuple[int, ...]) -> Float[Array, "*k2 i p"]:
-    """Weights of the pixels that come of one where the image is expanded, whose other pixels would all be zero.
+def _of_phases(weight: Float[Array, "3 3 i o"]) -> Float[Array, "2 2 i p"]:
+    """Weights of the 2×2 pixels that come of one where the image is expanded, whose other pixels would all be zero.
 
     Of three weights in a row, those of a pixel of the image and the next: the middle one and none for the first of the
     two pixels, the first and the last one for the second.
     """
-    for axis, step in enumerate(expansion):
-        if step == 2:
-            before, at, after = jnp.split(weight, 3, axis)
-            pairs = (at, jnp.zeros_like(at)), (before, after)
-            weight = jnp.stack([jnp.concatenate(pair, axis) for pair in pairs], axis=-1)
-    return weight.reshape(*weight.shape[: len(expansion) + 1], -1)
-
-
-def _interleaved(found: Float[Array, "n *k p"], expansion: tuple[int, ...]) -> Float[Array, "n *k2 o"]:
-    """The image of channels in which the pixels of each phase stand."""
-    axes, phases = len(expansion), [step for step in expansion if step > 1]
-    found = found.reshape(*found.shape[:-1], -1, *phases)
-    for axis, step in enumerate(expansion):
-        if step > 1:
-            found = jnp.moveaxis(found, axes + 2, axis + 2)
-            size = found.shape
-            found = found.reshape(*size[: axis + 1], step * size[axis + 1], *size[axis + 3 :])
-    return found
+    for axis in (0, 1):
+        before, at, after = jnp.split(weight, 3, axis)
+        pairs = (at, jnp.zeros_like(at)), (before, after)
+        weight = jnp.stack([jnp.concatenate(pair, axis) for pair in pairs], axis=-1)
+    return weight.reshape(*weight.shape[:3], -1)
 
 
 def chain(image: Float[Array, "*b i"], convs: Sequence[Conv]) -> Float[Array, "*b2 o"]:

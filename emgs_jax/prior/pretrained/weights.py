@@ -55,9 +55,9 @@ def conv(
     part: Tensors,
     name: str,
     norm: str | None = None,
-    stride: int | tuple[int, ...] = 1,
+    stride: int = 1,
     dilation: int = 1,
-    expansion: int | tuple[int, ...] = 1,
+    expansion: int = 1,
 ) -> Conv:
     """The convolution `name`, transposed where it expands, with the batch normalisation `norm` after it."""
     weight = np.float64(part[f"{name}.weight"])

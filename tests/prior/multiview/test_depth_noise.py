@@ -8,7 +8,7 @@ from stereo_scene import matrix, sources
 
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.multiview.depth import mean_difference, pixels_per_log_depth
-from emgs_jax.prior.multiview.depth_noise import DepthNoiseConfig, relative_std, surest
+from emgs_jax.prior.multiview.depth_noise import DepthNoiseConfig, relative_std
 
 FOCAL, WIDTH, HEIGHT = 55.0, 64, 48
 CONFIG = DepthNoiseConfig(pixel_std=0.5, spread_std=2.0, difference_std=3.0, max_std=0.1)
@@ -87,14 +87,3 @@ def test_a_view_that_confirms_nothing_counts_as_one_however_wrong_it_is_and_one_
     assert np.isinf(difference(2.0, [none, none])).all() and np.isinf(difference(0.0, [plane(2.0)] * 2)).all()
     turned, beside = moved((0, 0, 0), turn=(0, np.pi, 0)), moved((30.0, 0, 0))
     assert all(np.isinf(difference(2.0, [plane(2.0)], poses=poses)).all() for poses in (turned, beside))
-
-
-def test_of_two_estimates_the_surest_counts_and_what_agrees_with_it_moves_it():
-    depths = np.float32([[[2.0, 2.0, 0.0, 2.0, 0.0, 2.0]], [[2.02, 3.0, 3.0, 2.5, 0.0, 2.02]]])
-    stds = np.float32([[[0.01, 0.01, 0.01, np.inf, 0.01, 0.0]], [[0.02, 0.02, 0.02, 0.02, 0.01, 0.02]]])
-    depth, std = surest(depths, stds)
-    between = 2.0 * 1.01**0.2  # by 1/σ², 4 to 1
-    np.testing.assert_allclose(depth[0], [between, 2.0, 3.0, 2.5, 0.0, 2.0], rtol=1e-5)
-    np.testing.assert_allclose(std[0], [0.01, 0.01, 0.02, 0.02, np.inf, 0.0])
-    for values, alone in zip((depths[0], stds[0]), surest(depths[:1], stds[:1]), strict=True):
-        np.testing.assert_array_equal(alone[0, :2], values[0, :2])  # to the bit

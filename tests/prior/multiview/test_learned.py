@@ -85,18 +85,6 @@ def test_settings_say_which_weights_and_not_where_they_lie(monkeypatch):
     assert settings[0] == settings[1] != settings[2] and settings[2]["dense"]["sha256"] == "0f"
 
 
-def test_settings_say_what_is_beside_the_network(monkeypatch):
-    monkeypatch.setattr(module, "load_network", lambda *given: random_network())
-
-    def dense(*words):
-        node = compose("prior=multiview_stereo", "prior/dense=effimvs", *words).prior
-        return hydra.utils.instantiate(node).provenance.settings["dense"]
-
-    alone = hydra.utils.instantiate(compose("prior=multiview_stereo").prior).provenance.settings["dense"]
-    assert dense()["beside"] == alone
-    assert "beside" not in dense("prior.dense.beside=null") and "beside" not in alone
-
-
 def test_without_its_file_the_prior_is_refused_with_the_place_where_it_is_published():
     with pytest.raises(hydra.errors.InstantiationException) as error:
         hydra.utils.instantiate(prior_node())

@@ -1,11 +1,10 @@
 """A stand-in for the package mapanything, and a machine without a network."""
 
 import sys
-from types import ModuleType
+from types import ModuleType, SimpleNamespace
 
 import pytest
 from network_double import Double, Sphere
-from network_stand_in import Loaded
 
 
 @pytest.fixture
@@ -21,11 +20,9 @@ def torch(monkeypatch, tmp_path):
 def framework(monkeypatch, torch):
     """A stand-in for the package, around a double whose arrays are tensors."""
     data = Sphere()
-    model = Loaded(Double(data, convert=torch.from_numpy))
-    modules = {name: ModuleType(name) for name in ("mapanything", "mapanything.models", "mapanything.utils.inference")}
-    for name, module in modules.items():
-        monkeypatch.setitem(sys.modules, name, module)
-    monkeypatch.setitem(sys.modules, "mapanything.utils", ModuleType("mapanything.utils"))
+    model = SimpleNamespace(infer=Double(data, convert=torch.from_numpy).infer)
+    for name in ("mapanything", "mapanything.models"):
+        monkeypatch.setitem(sys.modules, name, ModuleType(name))
 
     mixin = pytest.importorskip("huggingface_hub", reason="MapAnything is loaded by its mixin").PyTorchModelHubMixin
     pytest.importorskip("safetensors", reason="the mixin reads such files")
@@ -43,14 +40,10 @@ def framework(monkeypatch, torch):
 
         def infer(self, views, **options):
             assert not self.training
-            return model._double.infer(views, **options)
+            return model.infer(views, **options)
 
-    modules["mapanything.models"].MapAnything = MapAnything
-    modules["mapanything.models"].init_model_from_config = lambda name, device: model
-    modules["mapanything.utils.inference"].postprocess_model_outputs_for_inference = lambda raw, views, apply_mask: (
-        raw if not apply_mask else None
-    )
-    return data, model, modules["mapanything.models"]
+    sys.modules["mapanything.models"].MapAnything = MapAnything
+    return data, model
 
 
 @pytest.fixture

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from scene import compose
 
-from emgs_jax.prior.network.masks import consistent, depth_edges, grid_normals, normal_edges, usable
+from emgs_jax.prior.network.masks import depth_edges, grid_normals, normal_edges, usable
 
 SHAPE = (14, 17)
 
@@ -120,40 +120,3 @@ def test_the_mask_of_a_view_is_upstreams_combination_and_neutral_values_turn_eve
         got = np.asarray(usable(spoiled, ones, mask, config()))
         assert not got[7, 8]
         np.testing.assert_array_equal(got[far], clean[far])
-
-
-@pytest.fixture(scope="module")
-def views():
-    """Three views of the wall z = 3 with other depths in places: depths, intrinsics, T_anchor_view."""
-    rng = np.random.default_rng(5)
-    T = np.tile(np.eye(4), (3, 1, 1))
-    T[:, :3, 3] = [(0, 0, 0), (0.4, 0.1, 0.3), (-0.3, 0, -0.4)]
-    depths = 3.0 - T[:, 2, 3][:, None, None] + np.where(rng.uniform(size=(3, *SHAPE)) < 0.3, 0.4, 0.0)
-    depths[1, 3:6, 4:9] = 0
-    K = np.tile(np.array([[13.0, 0, 8.2], [0, 12.0, 6.1], [0, 0, 1]]), (3, 1, 1))
-    K[2, 0, 0] = 14.0
-    return depths, K, T
-
-
-def contradicted(row, depths, K, T, settings):
-    """Where upstream's inliers / (inliers + outliers) is too low, one pixel after the other."""
-    found = np.zeros(SHAPE, bool)
-    for y, x in np.argwhere(depths[row] > 0):
-        point, agrees = np.append(depths[row, y, x] * (np.linalg.inv(K[row]) @ (x, y, 1)), 1), []
-        for other in (view for view in range(len(depths)) if view != row):
-            u, v, z = K[other] @ (np.linalg.inv(T[other]) @ T[row] @ point)[:3]
-            if z > 0 and 0 <= u / z <= SHAPE[1] - 1 and 0 <= v / z <= SHAPE[0] - 1:
-                seen, tolerance = depths[other, round(v / z), round(u / z)], 0.02 + settings.consistent_depth_share * z
-                agrees += [abs(z - seen) < tolerance] if seen > 0 else []
-        found[y, x] = bool(agrees) and np.mean(agrees) < settings.min_consistent_share
-    return found
-
-
-@pytest.mark.parametrize("share", [0.5, 0.6])
-def test_what_enough_views_contradict_is_left_out_by_upstreams_rule(views, share):
-    for row, relative in ((0, 0.02), (1, 0.02), (2, 0.02), (1, 0.12)):  # 40 cm decide by whose depth the share is of
-        settings = config(min_consistent_share=share, consistent_depth_share=relative)
-        expected = contradicted(row, *views, settings)
-        # At a pixel's border rounding may fall to the other side.
-        assert np.mean(consistent(row, *views, settings) != expected) > 0.98
-        assert expected.mean() < 0.98 and (expected.any() or (share, relative) == (0.5, 0.12))

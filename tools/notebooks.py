@@ -4,18 +4,18 @@ Pictures get a palette and at most MAX_WIDTH pixels, pages that are long and pro
 stands beside the outputs, so that the tests see when they are of other code. Needs nbclient and ipykernel.
 """
 
-import argparse
 import base64
 import hashlib
 import io
 import json
+import sys
 import tempfile
 from pathlib import Path
 from typing import Any
 
 from PIL import Image
 
-NOTEBOOKS = Path(__file__).resolve().parents[2] / "notebooks"
+NOTEBOOKS = Path(__file__).resolve().parents[1] / "notebooks"
 MAX_WIDTH, NUM_COLORS = 900, 64
 MAX_PAGE = 10_000  # characters
 OUTPUTS_OF = "outputs_of"  # the key of the digest in a notebook's metadata
@@ -65,15 +65,7 @@ def execute(path: Path) -> None:
     path.write_text(json.dumps(values, indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
 
 
-def main() -> None:
-    parser = argparse.ArgumentParser(prog="python -m tools.notebooks", description=__doc__)
-    parser.add_argument("numbers", nargs="*", help="01 … of notebooks; all where there is none")
-    numbers = tuple(parser.parse_args().numbers)
-    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
-        if not numbers or path.name.startswith(numbers):
-            execute(path)
-            print(f"{path.name}: {path.stat().st_size / 1000:.0f} kB", flush=True)
-
-
 if __name__ == "__main__":
-    main()
+    for path in sorted(NOTEBOOKS.glob("*.ipynb")):
+        if path.name.startswith(tuple(sys.argv[1:] or [""])):
+            execute(path)

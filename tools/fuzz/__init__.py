@@ -1,1 +1,0 @@
-"""Damaged inputs of every kind: `python -m tools.fuzz --cases 10000 --seed 0`."""

@@ -1,1 +1,0 @@
-"""Long runs and hard scenes in one process: `python -m tools.soak --steps 10000`."""
