@@ -7,7 +7,7 @@ from tiny_run import TINY
 
 from emgs_jax import em, sequence
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
 
 
 def test_the_listing_compares_a_stage_with_its_replacement(monkeypatch):

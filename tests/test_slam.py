@@ -397,6 +397,7 @@ def test_a_step_after_a_lost_frame_is_tracked_again(state, settings):
     assert sc.pose_error(info.T_world_camera, sc.path_pose(FRAME + 1))[0] < 0.07
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "law",
     [
@@ -449,6 +450,7 @@ def predictions(window, count):
     return [window, *(exact(FRAME + i, has_newest=i < count - 1) for i in range(count))]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "capacities",
     [

@@ -11,6 +11,9 @@ from tiny_run import CONF
 from emgs_jax.config import configure
 from emgs_jax.device.settings import check_platforms, leave_memory_to_torch
 
+pytestmark = pytest.mark.slow
+
+
 KEY = "XLA_PYTHON_CLIENT_PREALLOCATE"
 
 

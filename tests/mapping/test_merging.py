@@ -22,7 +22,7 @@ from emgs_jax.report.merging import merge
 from emgs_jax.report.run_images import images_of
 from experiments.merge import merge_runs
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("smoke")]
 UNIT = 1.25  # of the second run: what its prior gives as that is a metre
 LOOPS = ("prior.level=1", "prior.version=2", "graph.place_recognition.min_gap=8")
 FIRST = (*LOOPS, "dataset.stride=4")

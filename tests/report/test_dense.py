@@ -16,6 +16,9 @@ from emgs_jax.ops.camera import unproject
 from emgs_jax.report.dense import center_cloud, dense_map
 from emgs_jax.report.labelling import LabelledMap
 
+pytestmark = pytest.mark.slow
+
+
 XS = 1.0 + 3.0 * np.arange(len(STATUSES))  # of the cameras, which see one metre to each side
 LENGTH = XS[-1] + 2.0
 

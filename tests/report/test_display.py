@@ -4,6 +4,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 from tiny_run import compose
 
@@ -17,7 +18,10 @@ from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.layers import LARGEST, closing_covariances
 from emgs_jax.report.splats import read_splats
 
+pytestmark = pytest.mark.xdist_group("tiny")
 
+
+@pytest.mark.slow
 def test_map_ply_drawn_as_3dgs_draws_it_closes_every_view(exact_run):
     """gsplat's convention: blur .3 px, its own opacity, up to 3.33 standard deviations; 98 % of what a view sees."""
     folder, _ = exact_run

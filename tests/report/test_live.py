@@ -19,6 +19,9 @@ from emgs_jax.report import live
 from emgs_jax.report.live import LiveConfig, live_view
 from experiments.sweep import sweep
 
+pytestmark = pytest.mark.slow
+
+
 NUM_FRAMES = 4
 PRIOR = SimpleNamespace(feature_names=("left", "right"), text_features=np.eye(2))
 

@@ -20,6 +20,9 @@ from emgs_jax.report.overview import (
     view_from_above,
 )
 
+pytestmark = pytest.mark.slow
+
+
 OURS, TRUTH, *MOVED = (255 * rgb(PATHS[name].paper) for name in ("poses", "truth", "online", "loops"))
 
 

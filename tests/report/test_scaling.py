@@ -21,6 +21,9 @@ from emgs_jax.report.export import factor_of, write_scaled
 from emgs_jax.report.finished_run import read_run
 from experiments.export import export_run
 
+pytestmark = pytest.mark.slow
+
+
 FACTOR = 1.7
 
 

@@ -15,6 +15,9 @@ from emgs_jax.io.trajectory import load_trajectory_tum, to_tum
 from experiments.segment import segment
 from tests.report.written_run import written_run
 
+pytestmark = pytest.mark.slow
+
+
 CLASSES = "5 wall\n9 sofa\n"
 TO_TRUTH = random_similarity(np.random.default_rng(3), 2.5)
 

@@ -9,6 +9,8 @@ from emgs_jax.config.configure import compose
 from experiments.command import check_arguments
 from experiments.shorthand import frame_size, keys_of, with_source
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture
 def video(tmp_path):

@@ -13,6 +13,8 @@ from emgs_jax.prior.files import pose_error
 from emgs_jax.prior.files.pose_error import calibration, pair_error, pose_angle, sampson
 from emgs_jax.prior.files.prior import _stored_words
 
+pytestmark = pytest.mark.slow
+
 
 @cache
 def room():

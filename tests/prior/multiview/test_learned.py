@@ -21,6 +21,9 @@ from emgs_jax.prior.multiview.dense import Scene
 from emgs_jax.prior.multiview.learned import grid_of, learned
 from emgs_jax.prior.multiview.lens import Lens
 
+pytestmark = pytest.mark.slow
+
+
 BESIDE = Path(__file__).resolve().parents[3].parent
 CHECKPOINT = Path(os.environ.get("ITERMVS_CHECKPOINT", BESIDE / "shared/weights/itermvs_blendedmvs_model_000015.ckpt"))
 T_SOURCE_VIEW = np.linalg.inv(np.stack(AROUND))

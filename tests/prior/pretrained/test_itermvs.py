@@ -22,6 +22,9 @@ from emgs_jax.prior.pretrained.itermvs import SOURCE, build_network
 from emgs_jax.prior.pretrained.layers import Conv, convolve, sample
 from emgs_jax.prior.pretrained.weights import load_network
 
+pytestmark = pytest.mark.slow
+
+
 CHECKPOINT = Path(os.environ.get("ITERMVS_CHECKPOINT", BESIDE / "shared/weights/itermvs_blendedmvs_model_000015.ckpt"))
 ORIGINAL = Path(os.environ.get("ITERMVS", BESIDE / "IterMVS"))
 DENSE = hydra.utils.instantiate(compose("prior=multiview_stereo", "prior/dense=itermvs").prior.dense)

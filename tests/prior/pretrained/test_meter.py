@@ -17,6 +17,9 @@ from views import BESIDE, random_views, real_views
 from emgs_jax.prior.pretrained.meter import SOURCE, build_network, predict
 from emgs_jax.prior.pretrained.weights import load_network
 
+pytestmark = pytest.mark.slow
+
+
 CHECKPOINT = Path(os.environ.get("METER_CHECKPOINT", BESIDE / "shared/weights/meter_nyu_xxs"))
 ORIGINAL = Path(os.environ.get("METER", BESIDE / "METER"))
 SIZE = (192, 256)
