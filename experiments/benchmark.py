@@ -1,36 +1,31 @@
-"""Run times of stages, of a registration beside Open3D's, of many settings: `python -m experiments.benchmark`.
+"""Run times of stages, of a registration beside Open3D's, in turns: `python -m experiments.benchmark`.
 
 Compilation and run time apart, everything in turns on the same data; the tables are printed and written to benchmark.md
-and benchmark.json in Hydra's folder. The parts: stages, icp, sweep.
+and benchmark.json in Hydra's folder. The parts: stages, icp.
 """
 
 import os
-from collections.abc import Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Sequence
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-import equinox as eqx
 import jax
-import jax.numpy as jnp
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.config.configure import build_dataset, build_prior
 from emgs_jax.io.files import write_file, write_json
-from emgs_jax.mapping.batch import step_states
 from emgs_jax.ops.executable import calling
 from emgs_jax.ops.precision import full_precision
-from emgs_jax.ops.pytree import stack
 from emgs_jax.report.columns import Table, markdown
 from emgs_jax.report.provenance import provenance
-from emgs_jax.slam import SlamConfig, step
+from emgs_jax.slam import step
 
 from .benchmark_icp import time_icp
 from .command import command
-from .timing import Candidate, Data, Timing, called, compare, interleaved, load, spread
+from .timing import Data, Timing, called, interleaved, load, spread
 
 
 def benchmark(config: DictConfig, folder: Path) -> list[Timing]:
@@ -40,7 +35,6 @@ def benchmark(config: DictConfig, folder: Path) -> list[Timing]:
     known = {
         "stages": lambda: time_stages(load(config), turns),
         "icp": lambda: time_icp(load(config), tuple(chosen.icp_offset), turns),
-        "sweep": lambda: time_settings(load(config), chosen.num_settings, turns),
     }
     unknown = set(config.parts) - set(known)
     if unknown or not config.parts:
@@ -68,30 +62,6 @@ def time_stages(data: Data, repetitions: int) -> list[Timing]:
     with calling(note):
         step(*given)
     return interleaved("stages", candidates | {"whole step": called(step, *given)}, repetitions)
-
-
-def time_settings(data: Data, counts: Sequence[int], repetitions: int) -> Iterator[Timing]:
-    """A step of many settings: the step's own executables in turn and on all cores at once, and stacked with vmap."""
-    given, config = (data.state, data.prediction, data.camera), data.config
-    compile_seconds = called(step, *given, config).compile_seconds
-
-    def on(num_threads: int, configs: Sequence[SlamConfig]) -> Candidate:
-        def call() -> None:
-            with ThreadPoolExecutor(num_threads) as threads:
-                list(threads.map(lambda one: jax.block_until_ready(step(*given, one)), configs))
-
-        return Candidate(call, compile_seconds)
-
-    for count in counts:
-        gates = config.em.max_mahalanobis_sq * jnp.linspace(0.5, 2.0, count)
-        configs = [eqx.tree_at(lambda c: c.em.max_mahalanobis_sq, config, gate) for gate in gates]
-        stacked = stack([data.state] * count), data.prediction, data.camera, stack(configs)
-        candidates = {
-            f"{count} settings, one after the other": on(1, configs),
-            f"{count} settings, {os.cpu_count()} threads": on(os.cpu_count() or 1, configs),
-            f"{count} settings, vmap": called(step_states, *stacked),
-        }
-        yield from compare(interleaved("sweep", candidates, repetitions), next(iter(candidates)))
 
 
 def report(timings: Sequence[Timing]) -> str:

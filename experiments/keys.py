@@ -61,10 +61,7 @@ def _is_once(values: Any) -> bool:
 
 TEXT, COUNT = Kind("text", _is_text), whole(1)
 SEEDS, NAMES = some("whole numbers", lambda value: _is(value, int) and value >= 0), some("names", _is_text)
-AT_ONCE = {"at_once": whole(1, or_null=True), "chunk": COUNT}
 KEYS: dict[str, dict[str, Kind]] = {
-    "sweep": AT_ONCE,
-    "tune": AT_ONCE | {"trials": COUNT, "best": COUNT, "startup": whole(0), "search_seed": whole(0)},
     "evaluate": {
         "seeds": Kind(f"{SEEDS.words}, each once", _is_once),
         "overrides": some("KEY=VALUE", lambda value: _is_text(value) and "=" in value, least=0),
@@ -74,7 +71,6 @@ KEYS: dict[str, dict[str, Kind]] = {
         "shard": TEXT,
     },
     "export": {"formats": some("names", _is_text, least=0)},  # the others are those of ExportConfig
-    "effects": {"repetitions": some("keys", _is_text, least=0), "align": one_of("protocol", "se3")},
     "embed": {"classes": NAMES},
     "segment": {
         "map": Kind("a folder or a list of folders", lambda value: _is_text(value) or NAMES.fits(value)),
@@ -102,7 +98,6 @@ KEYS: dict[str, dict[str, Kind]] = {
     "benchmark": {
         "parts": NAMES,
         "benchmark.repetitions": COUNT,
-        "benchmark.num_settings": some("whole numbers from 1 on", COUNT.fits),
         "benchmark.icp_offset": Kind("[m,rad]", _is_offset),
     },
 }

@@ -15,7 +15,6 @@ GROUPS = {
         "mapping/test_moving_scenes.py",
         "mapping/test_checkpoint.py",
         "scripts/test_query_and_segment.py",
-        "scripts/test_sweep_script.py",
         "scripts/test_predict.py",
         "prior/files/test_prior_files.py",
         "scripts/test_quality.py",
@@ -31,7 +30,6 @@ GROUPS = {
         "mapping/test_capacity.py",
         "test_slam.py",
         "test_worlds.py",
-        "mapping/test_batch.py",
     ),  # the first counts, as above
 }
 # What the quick subset (-m "not slow") takes nothing of, beside the marked tests: some five CPU seconds and more each.
@@ -58,8 +56,7 @@ SLOW = {
     "config/test_values.py",
     "device/test_compilation.py",
     "mapping/test_relocalized_start.py",
-    *(f"scripts/{name}.py" for name in ("test_command_line", "test_evaluate", "test_score", "test_sweep_script")),
-    "scripts/test_tune.py",
+    *(f"scripts/{name}.py" for name in ("test_command_line", "test_evaluate", "test_score")),
     "test_advice.py",
     "test_existence.py",
     "test_front_door.py",

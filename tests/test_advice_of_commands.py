@@ -34,11 +34,9 @@ from emgs_jax.loop_closure.place_recognition import Database, add_keyframe
 from emgs_jax.report.results import METRICS_FILE, is_finished
 from experiments.evaluate import plan
 from experiments.export import export_run
-from experiments.grid import read_axes, variants
 from experiments.polish import polish_run
 from experiments.query import query
 from experiments.score import score
-from experiments.search import read_objectives, read_space
 from experiments.segment import segment
 from experiments.view import view
 from tests.advice import (
@@ -234,51 +232,6 @@ OF_CONFIG = [
         {"words": ["prior=simulated", "prior/dense=itermvs"]},
         r"is a choice of (prior=\w+) only",
         {"words": "['{1}', prior/dense=itermvs]"},
-    ),
-]
-
-
-def read_sweep(root: Path, words: list[str]) -> list:
-    config = compose(*words, name="sweep")
-    return variants(config, read_axes(config))
-
-
-def read_search(root: Path, words: list[str]) -> tuple:
-    config = compose(*words, name="tune")
-    return read_space(config), read_objectives(config)
-
-
-OF_SWEEP = [
-    ({"words": []}, r"choose one with (sweep=gates) or '(axes=\S+)'$", *({"words": "['{1}']"}, {"words": '["{2}"]'})),
-    ({"words": ["axes={em.noise:[0]}"]}, r"near names: (slam\.em\.noise)", {"words": '["axes={{{1}:[0]}}"]'}),
-    ({"words": ["axes={slam.em.noise:2}"]}, r"write (\S+): \[(\d), …\]", {"words": '["axes={{{1}:[{2},3]}}"]'}),
-    (
-        {"words": ["axes={slam.em.noise:[0]}", "grid=all"]},
-        "grid must be one of product, (one_at_a_time)",
-        {"words": '["axes={{slam.em.noise:[0]}}", "grid={1}"]'},
-    ),
-    ({"words": ["axes={slam.em.noise:[-9]}"]}, r"(\d) to \S+, got -9", {"words": '["axes={{slam.em.noise:[{1}]}}"]'}),
-]
-
-
-def space(key: str, given: str) -> dict[str, str]:
-    return {"words": f'["space={{{{{key}:{given}}}}}"]'}
-
-
-OF_SEARCH = [
-    ({"words": []}, r"with (tune=gates), or '(space=\S+)'$", {"words": "['{1}']"}, {"words": '["{2}"]'}),
-    (space("em.noise", "[0,1]"), r"near names: (slam\.em\.noise)", space("{1}", "[0,1]")),
-    (space("slam.em.noise", "[1]"), "two or more different numbers", space("slam.em.noise", "[1,2]")),
-    (space("slam.em.noise", "3"), "must be a range {low: …, high: …", space("slam.em.noise", "{{low:0.1,high:1}}")),
-    (
-        space("slam.em.noise", "{{low:1,high:0.1}}"),
-        "needs low < high, and low above 0 with log: true",
-        space("slam.em.noise", "{{low:0.1,high:1,log:true}}"),
-    ),
-    (
-        {"words": ["tune=gates", "objectives=[best]"]},
-        r"must be minimize METRIC or maximize METRIC",
-        {"words": '["tune=gates", "objectives=[minimize trajectory/ate_sim3_m]"]'},
     ),
 ]
 
@@ -479,8 +432,6 @@ TABLES = {
     "evaluate": (write_finished, read_plan, OF_EVALUATION),
     "export": (written_with_points, read_export, OF_EXPORT),
     "query": (written_with_points, read_answer, OF_QUERY),
-    "sweep": (lambda root: None, read_sweep, OF_SWEEP),
-    "tune": (lambda root: None, read_search, OF_SEARCH),
     "config": (lambda root: None, lambda root, words: compose(*words), OF_CONFIG),
 }
 
@@ -490,6 +441,4 @@ sound = sound_files(TABLES)
 
 @each_remedy(TABLES)
 def test_what_a_message_advises_helps(name, cause, message, remedy, sound, tmp_path):
-    if name == "tune":
-        pytest.importorskip("optuna", reason="the extra of emgs tune: pip install -e .[tune]")
     check_helps(TABLES[name][1], sound(name), cause, message, remedy, tmp_path)

@@ -19,7 +19,7 @@ from experiments.evaluate import delegated
 
 ROOT = CONF.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "sweep", "tune", "protocol")
+GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "protocol")
 pages = pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
 
 
