@@ -51,10 +51,6 @@ def _is_text(value: Any) -> bool:
     return isinstance(value, str) and bool(value.strip())
 
 
-def _is_offset(value: Any) -> bool:
-    return _is_list(value) and len(value) == 2 and all(_is(one, int | float) and math.isfinite(one) for one in value)
-
-
 def _is_once(values: Any) -> bool:
     return SEEDS.fits(values) and len(set(values)) == len(values)
 
@@ -95,11 +91,6 @@ KEYS: dict[str, dict[str, Kind]] = {
         "normal_neighbours": whole(3, 1000),
     },
     "view": {"port": whole(1, 65535)},
-    "benchmark": {
-        "parts": NAMES,
-        "benchmark.repetitions": COUNT,
-        "benchmark.icp_offset": Kind("[m,rad]", _is_offset),
-    },
 }
 FOLDERS = ("out", "folder", "map", "root")  # of commands, where they have to be given
 

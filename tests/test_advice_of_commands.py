@@ -8,7 +8,6 @@ from functools import cache
 from pathlib import Path
 from unittest import mock
 
-import hydra
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from scene import random_gaussians
 
 import experiments.evaluate as evaluate_module
 import experiments.polish as polish_module
-import experiments.tables as tables_module
+import tools.tables as tables_module
 from emgs_jax import load_config, save_map
 from emgs_jax.back_end.saved_map import load_saved_map, save_places
 from emgs_jax.back_end.state import BackEnd
@@ -371,12 +370,12 @@ def read_tables(root: Path, page: str = "page.md", is_dirty: bool = False, out: 
         write_json(path, content)
 
     with (
-        hydra.initialize_config_dir(version_base="1.3", config_dir=str(tiny_run.CONF)),
         mock.patch.object(evaluate_module, "run", run),
         mock.patch.object(tables_module, "git_now", lambda: ONE_COMMIT | {"dirty": is_dirty}),
     ):
-        words = [f"page={root / page}", f"full_page={root / 'full.md'}", f"out={root / out}", "root=nowhere"]
-        config = OmegaConf.to_container(hydra.compose("tables", words), resolve=True)
+        config = OmegaConf.to_container(OmegaConf.load(tables_module.CONFIG), resolve=False)
+        config |= {"page": str(root / page), "full_page": str(root / "full.md"), "out": str(root / out)}
+        config["root"] = "nowhere"
         config["short"]["data"] = ["synthetic"]
         config["tables"] = {"some": [{"data": ["synthetic"], "seeds": [3], "settings": {"default": {}}}]}
         tables_module.tables(config)

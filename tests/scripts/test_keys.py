@@ -48,14 +48,6 @@ def composed(name: str):
         ("segment", "map", [], r"map must be a folder or a list of folders, got \[\]"),
         ("predict", "out", None, "out must be text, got null"),
         ("embed", "classes", 3, "classes must be a list of names, got 3"),
-        ("benchmark", "benchmark.repetitions", 0, "benchmark.repetitions must be a whole number from 1 on, got 0"),
-        (
-            "benchmark",
-            "benchmark.num_settings",
-            [0],
-            "benchmark.num_settings must be a list of whole numbers from 1 on",
-        ),
-        ("benchmark", "benchmark.icp_offset", [0, math.inf], r"benchmark.icp_offset must be \[m,rad\]"),
     ],
 )
 def test_a_value_of_another_kind_is_named_with_its_key(name, key, value, message):

@@ -58,12 +58,11 @@ def main() -> None:
 
 def calls(words: list[str]) -> list[tuple[Callable, tuple]]:
     """The executables of the step after the first window, and what each is called with."""
-    from emgs_jax.config.configure import compose
     from emgs_jax.ops.executable import calling
     from emgs_jax.slam import step
-    from experiments.timing import load
+    from tools.benchmark import load
 
-    data = load(compose(*words))
+    data = load(*words)
     noted: list[tuple[Callable, tuple]] = []
 
     def note(executable: Callable, *arguments: Any) -> Any:
@@ -71,7 +70,7 @@ def calls(words: list[str]) -> list[tuple[Callable, tuple]]:
         return executable(*arguments)
 
     with calling(note):
-        step(data.state, data.prediction, data.camera, data.config)
+        step(*data)
     return noted
 
 
