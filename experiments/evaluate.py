@@ -26,6 +26,7 @@ from emgs_jax.io.files import check_writable, write_file, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
 from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
 from emgs_jax.report.provenance import code_now, code_of
+from emgs_jax.report.published import published
 from emgs_jax.report.results import METRICS_FILE, is_finished, read_estimates, read_metrics, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
 
@@ -125,7 +126,7 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
     try:
         _run_all(open_jobs, failures)
     finally:
-        rows, found = _write_tables(out, jobs, failures, settings["published"])
+        rows, found = _write_tables(out, jobs, failures)
         worse = regressions(baseline, rows)
         write_evaluation_page(out, found._replace(gate=settings["gate"], regressions=worse), command_line)
     if settings["write_gate"]:
@@ -170,9 +171,7 @@ def _shard(text: str) -> tuple[int, int]:
     return int(part), int(whole)
 
 
-def _write_tables(
-    out: Path, jobs: Sequence[Job], failures: Mapping[str, str], published: Sequence[Mapping[str, Any]]
-) -> tuple[list[Row], Found]:
+def _write_tables(out: Path, jobs: Sequence[Job], failures: Mapping[str, str]) -> tuple[list[Row], Found]:
     """Write results.csv, results.json and results.md; returns the rows by sequence, and what the page shows.
 
     They show the jobs of this evaluation and other systems: older results in `out` may have other settings.
@@ -182,14 +181,15 @@ def _write_tables(
     totals, rows = average(estimates, each_sequence=False), average(estimates, each_sequence=True)
     done = {item.folder for item in estimates}
     missing = {job.name: failures.get(job.name, "to do") for job in jobs if job.folder not in done}
-    parts, shown = [paper_table(totals, published)], [*rows, *(row for row in totals if len(row.sequences) > 1)]
+    quoted = published("reconstruction")
+    parts, shown = [paper_table(totals, quoted)], [*rows, *(row for row in totals if len(row.sequences) > 1)]
     parts.append(full_table(shown) if rows else "")
     parts.append("".join(f"- not finished: {name}: {reason}\n" for name, reason in missing.items()))
     text = "\n".join(part for part in parts if part)
     out.mkdir(parents=True, exist_ok=True)
     for name, content in (("results.csv", to_csv(estimates)), ("results.md", text)):
         write_file(out / name, content)
-    write_json(out / "results.json", {"rows": rows, "totals": totals, "published": published, "missing": missing})
+    write_json(out / "results.json", {"rows": rows, "totals": totals, "published": quoted, "missing": missing})
     print(text)
     lines = [JobLine(job.name, job.folder, missing.get(job.name, "")) for job in jobs]
     return rows, Found(lines, shown, estimates)

@@ -13,6 +13,7 @@ from emgs_jax.data.class_file import read_classes
 from emgs_jax.evaluation.segmentation import LabelledPoints, TrueLabels, read_labelled_mesh
 from emgs_jax.io.files import write_file, write_json
 from emgs_jax.report.finished_run import FinishedRun, read_run
+from emgs_jax.report.published import published
 from emgs_jax.report.run_images import images_of
 from emgs_jax.report.segmentation_table import Placement, SceneResult, score_scene, summary, table
 from emgs_jax.report.vocabulary import feature_model, vocabulary
@@ -41,7 +42,7 @@ def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
         text = vocabulary(run, config.features.text, feature_model(config, classes)).embed(classes)
         results.append(score_scene(run, scene, truth, text.vectors, how, protocol))
     found = summary(results, classes, protocol, how) | {"truth": str(config.truth), "templates": text.templates}
-    said = table(found, config.table_iii)
+    said = table(found, published("segmentation"))
     write_json(Path(config.out) / f"segmentation_{protocol.name}.json", found)
     write_file(Path(config.out) / f"segmentation_{protocol.name}.md", said)
     return found, said

@@ -17,11 +17,10 @@ from emgs_jax.slam import SlamConfig
 
 ROOT = CONF.parent
 # Studies and suites hold no class; tests/scripts composes them.
-UNTYPED = {CONF} | {CONF / name for name in ("densify_on", "experiment", "experiment_on", "suite", "sweep", "tune")}
-GATE = CONF / "baseline" / "smoke.yaml"  # results to compare with, no option
+UNTYPED = {CONF} | {CONF / name for name in ("densify_on", "experiment", "experiment_on", "suite")}
 OF_COMMANDS = {"protocol": "segment"}  # groups of another command than a run
 OF_PRIORS = {"prior/dense": "prior=multiview_stereo"}  # groups of one prior
-GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED and path != GATE)
+GROUPED = sorted(path for path in CONF.rglob("*.yaml") if path.parent not in UNTYPED)
 
 
 def group_and_option(path: Path) -> tuple[str, str]:
