@@ -33,7 +33,7 @@ from emgs_jax.report.sweeps import SweepResults, picture_path
 from .grid import Variant, plain_setting
 
 NOT_OF_RESULTS = (  # keys that change no number of a setting
-    *("axes", "grid", "chunk", "at_once", "compilation_cache", "checksums"),
+    *("axes", "grid", "chunk", "at_once", "compilation_cache"),
     *("space", "objectives", "tuned", "held_out", "trials", "startup", "search_seed", "best"),
 )
 

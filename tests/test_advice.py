@@ -2,7 +2,6 @@
 
 import json
 import shutil
-import subprocess
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -18,7 +17,6 @@ from PIL import ExifTags, Image
 from emgs_jax.config.configure import build, compose, message_of
 from emgs_jax.data.bonn import Bonn
 from emgs_jax.data.calibration_files import read_calibration
-from emgs_jax.data.checksums import SUMS_FILE, WRITE
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.data.euroc import Euroc
 from emgs_jax.data.images import Images
@@ -68,7 +66,7 @@ def frames(build: Callable, **defaults) -> Callable[..., int]:
 
     def read(folder: Path, **options) -> int:
         given = {"root": str(folder), "stride": 1} | defaults | options
-        reading = {key: given.pop(key) for key in ("on_bad_frame", "checksums") if key in given}
+        reading = {key: given.pop(key) for key in ("on_bad_frame",) if key in given}
         return len([*ReadableFrames(build(**given), **reading)])
 
     return read
@@ -86,18 +84,11 @@ LABELS = (
 )
 LINE = r"groundtruth.txt, line 3: .*: correct the line or take it out .* or set on_bad_frame=skip"
 NO_LINE = lines(TRUTH, lambda words: words * (words[0] != "100.9950"))
-COMMAND = r" \((?P<command>cd FOLDER .*? > SHA256SUMS)\)"
 
 
 def shifted(time: float = 0.0, x: float = 0.0) -> Step:
     """The true path at other times or elsewhere."""
     return lines(TRUTH, lambda words: [f"{float(words[0]) + time:.4f}", str(float(words[1]) + x), *words[2:]])
-
-
-def listed(root: Path, said: Said) -> None:
-    """The command that writes checksums, as a message says it where there is one."""
-    command = WRITE if said is None else said["command"]
-    subprocess.run(command.replace("FOLDER", f"'{root / TUM}'"), shell=True, check=True)
 
 
 OF_TUM = [
@@ -187,23 +178,6 @@ OF_TUM = [
     ((LABELS, put(LABEL, np.uint8(WALL + 40))), "write it with 16 bits", put(LABEL, WALL + 296)),
     ((LABELS, put(LABEL, WALL + 3)), r"dataset\.(unknown)=", *({"unknown": [0, 7]}, put(CLASSES, "4 wall\n7 cup\n"))),
     ((LABELS, {"unknown": "7"}), "must be a list of ids, whole numbers from 0", {"unknown": [0]}),
-    (
-        (listed, edit(TRUTH, ("100.9950 0.04", "100.9950 0.05")), {"checksums": "auto"}),
-        f"fetch the file again, write the list again if it is right{COMMAND}, or set on_bad_frame=skip",
-        *(fetched(TRUTH), listed, {"checksums": "off"}),
-    ),
-    ((listed, put(COLOR, color_image(2, (640, 480))), {"checksums": "auto"}), "or set on_bad_frame=skip", SKIP),
-    (
-        (put(f"{TUM}/rgb/{SUMS_FILE}", "0" * 64 + "  x.png\n"), {"checksums": "auto"}),
-        f"lacks 3 of the 3 images in use, .*: write it again{COMMAND}, or set checksums=off",
-        *((gone(f"{TUM}/rgb/{SUMS_FILE}"), listed), {"checksums": "off"}),
-    ),
-    (
-        (put(f"{TUM}/{SUMS_FILE}", "x"), {"checksums": "auto"}),
-        f"expected 64 hexadecimal digits.*; write the list again{COMMAND}",
-        listed,
-    ),
-    ({"checksums": "nowhere"}, "give the file, auto or off", {"checksums": "auto"}, {"checksums": "off"}),
     ({"on_bad_frame": "maybe"}, "must be error or skip", {"on_bad_frame": "error"}, SKIP),
 ]
 
@@ -754,8 +728,8 @@ OF_RECORDED = [
     ({"folder": "."}, "manifest.json is missing: expected the folder of a recording", {"folder": "recording"}),
     (put(MANIFEST, "{"), "is damaged .*: record into another folder with .*experiments.predict", ELSEWHERE),
     (put(MANIFEST, "[]"), "is not of the format .*: record into another folder", ELSEWHERE),
-    (edit(MANIFEST, ('"version": 3', '"version": 9')), "has version 9, .*: record into another folder", ELSEWHERE),
-    (edit(MANIFEST, ('"version": 3', '"version": 2')), "SHA-256 does not fit.: record into another", ELSEWHERE),
+    (edit(MANIFEST, ('"version": 3', '"version": 2')), "has version 2, .*: record into another folder", ELSEWHERE),
+    (edit(MANIFEST, ('"window_size": 3', '"window_size": 2')), "SHA-256 does not fit.: record into another", ELSEWHERE),
     (put(INFERENCE, b"PK"), "000001.npz is damaged .*experiments.predict.* makes what is missing or damaged", again),
     (gone(INFERENCE), "000001.npz is missing: .*experiments.predict.* makes what is missing or damaged", again),
     ({"size": 4}, "window_size 3, but this run has 4: .* or record into another folder", {"size": 3}),
