@@ -61,11 +61,6 @@ def test_intrinsics_are_numbers_that_a_name_may_precede():
             check_value("dataset.intrinsics", given, field)
 
 
-@pytest.mark.parametrize("option", ["conceptgraphs", "ovo", "rayfronts"])
-def test_every_value_of_a_protocol_is_in_its_range(option):
-    check_values(configure.compose(f"protocol={option}", name="segment"), "protocol")
-
-
 @pytest.mark.parametrize(
     ("override", "message"),
     [

@@ -34,7 +34,7 @@ def test_values_of_a_traced_key_share_one_compilation(tmp_path):
     assert rows[0][ATE] != rows[1][ATE]
 
 
-@pytest.mark.long
+@pytest.mark.weekly
 def test_the_search_of_the_page_finds_what_its_trials_say_and_goes_on(tmp_path, monkeypatch, capsys):
     """The code of docs/experiments.md as it stands there, of two trials on a small sequence."""
     optuna = pytest.importorskip("optuna")
