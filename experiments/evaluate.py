@@ -24,7 +24,7 @@ from emgs_jax.config.overrides import quoted, written
 from emgs_jax.config.values import check_values
 from emgs_jax.io.files import check_writable, write_file, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
-from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
+from emgs_jax.report.gate import TOLERANCES, read_gate, regressions, rounding_tolerances, write_gate
 from emgs_jax.report.provenance import code_now, code_of
 from emgs_jax.report.published import published
 from emgs_jax.report.results import METRICS_FILE, is_finished, read_estimates, read_metrics, result_folder
@@ -34,6 +34,7 @@ from .command import command, overrides_of
 from .run import run
 
 ERROR_FILE = "error.txt"
+SEQUENCE = "dataset.sequence"  # key of the runs that the sequences of a suite are values of, unless it names another
 
 
 @dataclass(frozen=True)
@@ -53,7 +54,7 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
             own, changed = (
                 [f"{key}={written(value)}" for key, value in some.items()] for some in (data["overrides"], changes)
             )
-            _check_free([*settings["overrides"], *changed], dataset, data["key"])
+            _check_free([*settings["overrides"], *changed], dataset, data.get("key", SEQUENCE))
             overrides = [f"dataset={dataset}", *own, *settings["overrides"], *changed]
             common = compose(*overrides)
             has_seed = "seed" in common.prior
@@ -62,7 +63,7 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
             for sequence in data["sequences"]:
                 for seed in settings["seeds"]:
                     config = copy.deepcopy(common)
-                    OmegaConf.update(config, data["key"], sequence)
+                    OmegaConf.update(config, data.get("key", SEQUENCE), sequence)
                     if has_seed:
                         config.prior.seed = seed
                     for part in config:
@@ -130,7 +131,7 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
         worse = regressions(baseline, rows)
         write_evaluation_page(out, found._replace(gate=settings["gate"], regressions=worse), command_line)
     if settings["write_gate"]:
-        tolerances = settings["tolerances"]
+        tolerances = TOLERANCES | settings["tolerances"]
         if settings["rounded"]:
             rounded = read_estimates(Path(settings["rounded"]))
             tolerances = rounding_tolerances(tolerances, read_estimates(out), rounded, len(settings["seeds"]))

@@ -24,8 +24,6 @@ FRAMES = "frames"  # the word that takes the labels of the data set's own frames
 
 def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
     """Score the maps of `config` and write file and table; returns both."""
-    if config.num_neighbours < 1:
-        raise ValueError(f"num_neighbours={config.num_neighbours} must be 1 or more")
     counting = Counting(config.num_neighbours, tuple(config.ignored))
     how = Placement(config.alignment, config.with_scale, config.icp_distance_m, config.icp_max_steps)
     runs = [read_run(Path(str(folder))) for folder in (config.map if _is_list(config.map) else [config.map])]
