@@ -8,17 +8,22 @@ from importlib import import_module
 from .console import speak_on
 from .interrupt import clear_interrupt
 
-COMMANDS = (
-    *("run", "evaluate", "score", "report", "polish", "merge", "view"),
-    *("export", "predict", "embed", "query", "segment"),
-)
+GROUPS = {
+    "make a map": ("run", "merge", "predict"),
+    "look at it": ("view", "report", "polish", "export"),
+    "ask it": ("query", "embed"),
+    "measure": ("evaluate", "score", "segment"),
+}
+COMMANDS = tuple(name for names in GROUPS.values() for name in names)
 
 
 def usage() -> str:
-    """One line and an example for each command."""
-    lines = ["usage: emgs COMMAND [key=value …]", "", "commands:"]
-    for name in COMMANDS:
-        lines += [f"  {name:10} {words}" for name, words in zip((name, ""), beginning_of(name), strict=True)]
+    """One line and an example for each command, in groups."""
+    lines = ["usage: emgs COMMAND [key=value …]"]
+    for group, names in GROUPS.items():
+        lines += ["", f"{group}:"]
+        for name in names:
+            lines += [f"  {name:10} {words}" for name, words in zip((name, ""), beginning_of(name), strict=True)]
     lines += ["", "emgs COMMAND --help lists what can be chosen, emgs COMMAND --cfg job every key with its value."]
     return "\n".join(lines)
 

@@ -23,7 +23,7 @@ from emgs_jax.mapping.capacity import prepared_beside
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.mapping.convert import to_camera
 from emgs_jax.mapping.pipeline import finish_run, map_frames
-from emgs_jax.mapping.records import COMPILING, FrameRecord, show_records, to_line
+from emgs_jax.mapping.records import FrameRecord, show_records, to_line
 from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
@@ -158,7 +158,6 @@ def _map(
         FrameLog(folder / "frames.jsonl") as log,
         tqdm(total=len(dataset), unit="frame", desc="mapping") as bar,
     ):
-        bar.set_postfix_str(COMPILING)
 
         def frames() -> Iterator[tuple[FrameRecord, RawView]]:
             nonlocal run

@@ -1,6 +1,7 @@
 """`emgs run video.mp4`: what a video or a folder of images alone implies; keys that are given win."""
 
 import math
+import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -9,6 +10,8 @@ from emgs_jax.config.overrides import written
 from .command import overrides_of, words_of
 
 NUM_PIXELS, SIDE = 320 * 240, 16  # of a frame, and what its sides are multiples of
+NUM_FRAMES = 150  # of a video: about as many are taken, evenly
+SECONDS = 3.0  # that an image takes, from COLMAP to the report, on one core of a laptop
 
 
 def with_source(arguments: list[str]) -> list[str]:
@@ -30,7 +33,9 @@ def with_source(arguments: list[str]) -> list[str]:
         raise ValueError(f"{path} is no file or folder, and no key=value: emgs run --help lists the keys")
     given = [word for word in arguments if word != paths[0]]
     found = implied(path, keys_of(given))
-    print(f"{path}: {' '.join(found)}; keys that you give win")
+    print(f"{path} stands for {' '.join(found)}; what you give yourself wins")
+    if note := plan_note(path, keys_of([*found, *given])):
+        print(note)
     return [*found, *given]
 
 
@@ -56,7 +61,43 @@ def implied(path: Path, given: dict[str, str]) -> list[str]:
         found["prior"] = "multiview_stereo"
         if "baseline" not in given:  # it fuses frames where they were placed, the back end moves them afterwards
             found["graph"] = "up_to_scale"
+        stride = round(len(chosen(path, given)) / NUM_FRAMES)
+        if is_video(path) and stride > 1:
+            found["dataset.stride"] = str(stride)
     return [f"{key}={value}" for key, value in found.items() if key not in given]
+
+
+def is_video(path: Path) -> bool:
+    """Test whether the path is that of a video."""
+    from emgs_jax.data.video import VIDEO_SUFFIXES
+
+    return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
+
+
+def chosen(path: Path, given: dict[str, str]) -> range:
+    """The images of a video or folder that `dataset.start`, `stop` and `stride` choose; by the header of a video."""
+    from emgs_jax.data.images import listed
+    from emgs_jax.data.video import announced
+
+    images = range(announced(path) if is_video(path) else len(listed(path)[0]))
+    words = (given.get(f"dataset.{name}", "null") for name in ("start", "stop", "stride"))
+    try:
+        return images[slice(*(None if word == "null" else int(word) for word in words))]
+    except ValueError:  # no number, or several of a multirun
+        return images
+
+
+def plan_note(path: Path, keys: dict[str, str]) -> str:
+    """Say how many images are mapped and how long that takes, where COLMAP and stereo do it; else nothing."""
+    if keys.get("dataset") != "images" or keys.get("prior") != "multiview_stereo":
+        return ""
+    every, images = len(chosen(path, keys | {"dataset.stride": "1"})), chosen(path, keys)
+    minutes = max(round(len(images) * SECONDS / 60 / (os.cpu_count() or 1)), 1)
+    taken = f"{len(images)} of {every} images, every {images.step}th" if images.step > 1 else f"{every} images"
+    less = f"; dataset.stride={2 * images.step} halves that" if len(images) > NUM_FRAMES // 2 else ""
+    return (
+        f"{taken}, at {keys['dataset.size'].strip('[]').replace(',', '×')}: about {minutes} min on this machine{less}"
+    )
 
 
 def frame_size(width: int, height: int) -> tuple[int, int]:
@@ -69,8 +110,8 @@ def _size(path: Path) -> tuple[int, int]:
     """(width, height) of a video or a folder of images, as they are shown."""
     from emgs_jax.data.images import listed
     from emgs_jax.data.reading import first_size
-    from emgs_jax.data.video import VIDEO_SUFFIXES, Video
+    from emgs_jax.data.video import Video
 
-    if path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES:
+    if is_video(path):
         return Video(path, 1).read(0).shape[1::-1]
     return first_size(listed(path)[0], path)

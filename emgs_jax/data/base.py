@@ -72,6 +72,10 @@ class Dataset(Protocol):
         """Return the files of frame `index`: its image first, then lists and poses; empty where frames are made."""
         return ()
 
+    def number(self, index: int) -> int:
+        """Return the number of frame `index` where it has no file of its own: in the video that it is from."""
+        return index
+
     def fingerprint(self) -> str:
         """Hex digest over what defines the frames (files' names and contents, options), for provenance."""
         ...

@@ -52,7 +52,7 @@ class Images(Straightened):
             raw_size, files = reading.first_size(self._images, path), self._images
         else:
             raw_size, files = self._video.read(self._chosen[0]).shape[1::-1], []
-        pictures = Pictures(raw_size, len(self), self._shown, files, f"images of {self._place(0)[1]}")
+        pictures = Pictures(raw_size, len(self), self._shown, files, f"images of {self._place(0)[1]}", self._chosen)
         self._use(find_lens(self.intrinsics, pictures), raw_size, *notes)
 
     def _place(self, index: int) -> tuple[float, str]:
@@ -69,6 +69,9 @@ class Images(Straightened):
         image = self._shown(index)
         reading.check_raw_size(image, self._raw_size, self._place(index)[1])
         return image
+
+    def number(self, index: int) -> int:
+        return index if self._video is None else self._chosen[index]
 
     def _options(self) -> dict[str, Any]:
         lens = {} if self._lens.maps is None else {"lens": self.calibration["distortion"]}

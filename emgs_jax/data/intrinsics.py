@@ -38,6 +38,7 @@ class Pictures:
     read: Callable[[int], UInt8[np.ndarray, "_ _ 3"]]  # RGB image 0..count-1 as it is on disk; raises BadFrameError
     files: Sequence[Path] = ()  # their files; empty for a video
     name: str = "images"  # of them all, for messages
+    numbers: Sequence[int] = ()  # of the frames of a video
 
 
 Estimator = Callable[[Pictures], tuple[Calibration, dict[str, Any]]]

@@ -95,10 +95,10 @@ def masked(frame: Frame, is_out: Bool[np.ndarray, "h w"]) -> Frame:
 
 
 def names_of(dataset: Dataset) -> list[str]:
-    """A name for each frame in use: that of its file, or its number in the data set where files have no name each."""
-    kept = getattr(dataset, "kept", range(len(dataset)))
+    """A name for each frame in use: that of its file, or its number in the video where it has none of its own."""
     files = [dataset.files(index) for index in range(len(dataset))]
-    return image_names([found[0] if found else None for found in files], kept)
+    numbers = [*map(getattr(dataset, "number", int), range(len(dataset)))]
+    return image_names([found[0] if found else None for found in files], numbers)
 
 
 def image_names(files: Sequence[Path | None], numbers: Sequence[int]) -> list[str]:

@@ -95,6 +95,9 @@ class ReadableFrames:
     def pose(self, index: int) -> np.ndarray | None:
         return self._dataset.pose(self.kept[index])
 
+    def number(self, index: int) -> int:
+        return getattr(self._dataset, "number", int)(self.kept[index])
+
     def files(self, index: int) -> Sequence[Path]:
         return self._dataset.files(self.kept[index])
 

@@ -73,6 +73,12 @@ class Video:
         return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
+def announced(path: Path) -> int:
+    """Return the number of frames that the header of a video names; 0 where it names none."""
+    count = open_video(path).get(cv2.CAP_PROP_FRAME_COUNT)
+    return int(count) if math.isfinite(count) and count > 0 else 0
+
+
 def open_video(path: Path) -> cv2.VideoCapture:
     capture = cv2.VideoCapture(str(path))
     if not capture.isOpened():

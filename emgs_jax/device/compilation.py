@@ -4,12 +4,16 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
+from tqdm import tqdm
+
 
 def compile_all(compilations: Sequence[Callable[[], object]], is_wanted: Callable[[], bool] = lambda: True) -> None:
-    """Call functions that each compile something, on as many cores as there are.
+    """Call functions that each compile something, on as many cores as there are, with a progress bar.
 
     Args:
         is_wanted: asked before each; where it is not, the rest is left.
     """
-    with ThreadPoolExecutor(os.cpu_count()) as threads:
-        list(threads.map(lambda compilation: compilation() if is_wanted() else None, compilations))
+    bar = tqdm(total=len(compilations), desc="compiling, once", unit="stage", leave=False, disable=None)
+    with ThreadPoolExecutor(os.cpu_count()) as threads, bar:
+        for _ in threads.map(lambda compilation: compilation() if is_wanted() else None, compilations):
+            bar.update()

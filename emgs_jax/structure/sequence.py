@@ -46,7 +46,7 @@ def calibrate(
     """
     if config.camera_model not in PERSPECTIVE:
         raise ValueError(f"prior.structure.camera_model={config.camera_model}: there are {', '.join(PERSPECTIVE)}")
-    names = image_names([*pictures.files] or [None] * pictures.count, range(pictures.count))
+    names = image_names([*pictures.files] or [None] * pictures.count, pictures.numbers or range(pictures.count))
     (width, height), focal = pictures.size, _exif_focal(pictures)
     is_known = focal is not None and config.camera_model == "SIMPLE_RADIAL"
     start = (focal, width / 2, height / 2, 0.0) if is_known else ()

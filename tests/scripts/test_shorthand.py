@@ -44,10 +44,29 @@ def test_a_video_stands_for_the_keys_that_map_it_and_one_line_says_so(video, cap
         "prior": "multiview_stereo",
         "graph": "up_to_scale",
     }
-    said = capsys.readouterr().out
-    assert said.count("\n") == 1 and all(word in said for word in words)
+    first, second = capsys.readouterr().out.splitlines()
+    assert all(word in first for word in words) and second.startswith(
+        "5 images, at 336×224: about 1 min on this machine"
+    )
     check_arguments("config", words)
     assert compose(*words).dataset.root == str(video)
+
+
+def test_a_long_video_is_thinned_to_about_150_images_which_a_line_says_beforehand(tmp_path, capsys):
+    """A minute of 30 images a second was mapped whole: hours, without a word."""
+    path = tmp_path / "minute.mp4"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"mp4v"), 30.0, (32, 32))
+    for row in range(900):
+        writer.write(np.full((32, 32, 3), row % 256, np.uint8))
+    writer.release()
+
+    def stride_of(*given):
+        return keys_of(with_source([str(path), *given])).get("dataset.stride")
+
+    assert stride_of() == "6" and "150 of 900 images, every 6th" in capsys.readouterr().out
+    assert stride_of("dataset.start=300") == "4" and stride_of("dataset.stop=200") is None
+    assert stride_of("dataset.stride=9") == "9" and stride_of("prior=files") is None
+    assert "100 of 900 images, every 9th" in capsys.readouterr().out
 
 
 def test_a_folders_camera_is_calibrated_whatever_its_exif_says(tmp_path):
