@@ -1,6 +1,7 @@
 """Expectation-maximisation map update (Method D, eq. 2 to 4): aligned points move the Gaussians that explain them."""
 
 import math
+from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -273,18 +274,19 @@ def em_update(
     noise: Float[Array, "m 3"],
     config: EmConfig,
     index: GaussianIndex | None = None,
+    e_step: Callable[..., tuple[EStep, Array]] = _e_step,
 ) -> tuple[GaussianMap, EStep, EmInfo]:
     """One incremental EM step: fuse the points of `aligned` (world frame) that the submap explains.
 
     `noise` is the standard deviation of each point along its viewing ray, a vector in metres;
-    `index` as in `e_step`.
+    `index` as in `e_step`, in whose place another function may stand.
 
     Returns:
         The updated submap, what explains which point, and counts. Without any fused point the submap is unchanged.
     """
     gaussians, (aligned, noise) = submap.gaussians, _sound(aligned, noise)
     index = index_of(gaussians) if index is None else index
-    step, best = _e_step(gaussians, aligned, noise, config, index)
+    step, best = e_step(gaussians, aligned, noise, config, index)
     new, total = m_step(gaussians, aligned, precision(noise, config), step, config)
     evidence = jnp.where(total > 0, support(gaussians, aligned, step, config), 0.0)
     updated, gain = update_average(submap, new, evidence, config.average)

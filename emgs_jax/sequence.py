@@ -1,6 +1,6 @@
 """From words to a mapped sequence: `map_sequence(load_config("dataset=images", …))`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from hydra.errors import InstantiationException
@@ -15,10 +15,10 @@ from emgs_jax.device.clock import Clock
 from emgs_jax.device.settings import use_compilation_cache
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.mapping.pipeline import finish_run, map_frames
-from emgs_jax.mapping.records import COMPILING, show_records
+from emgs_jax.mapping.records import show_records
 from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.render.densify import DensifyConfig
-from emgs_jax.slam import SlamConfig
+from emgs_jax.slam import SlamConfig, Stage
 
 
 @dataclass(frozen=True)
@@ -59,13 +59,17 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
     return RunConfig(settings=settings, slam=slam, densify=densify, evaluation=evaluation, graph=graph)
 
 
-def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
+def map_sequence(config: RunConfig, show_progress: bool = True, **stages: Stage) -> MappingRun:
     """Map the sequence of a config; the run holds the map, and a record with a pose for every frame.
+
+    Args:
+        stages: functions in the place of those of a step, by the names of `slam.Stages`: `em_update=mine`.
 
     Raises:
         ValueError: the data set, the prior or a frame cannot be used.
     """
-    settings = OmegaConf.create(config.settings)
+    settings, slam = OmegaConf.create(config.settings), config.slam
+    slam = replace(slam, stages=slam.stages._replace(**stages))
     use_compilation_cache(settings.compilation_cache)
     dataset = build_dataset(settings)
     prior = build_prior(settings, dataset)
@@ -76,8 +80,7 @@ def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
         Clock().watching() as clock,
         tqdm(total=len(dataset), unit="frame", desc="mapping", disable=not show_progress) as bar,
     ):
-        bar.set_postfix_str(COMPILING)
-        run = start = new_run(dataset, config.slam, clock, graph=config.graph, saved=saved)
+        run = start = new_run(dataset, slam, clock, graph=config.graph, saved=saved)
         for run, new, _ in map_frames(start, dataset, prior):
             show_records(bar, run.records, len(new))
         return finish_run(run)

@@ -1,6 +1,8 @@
 """The pipeline: `init_state` makes the map of the first window, `step` integrates one frame. Both are pure."""
 
+from collections.abc import Callable
 from dataclasses import replace
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -55,6 +57,27 @@ from emgs_jax.registration.rigid import median, pose_row
 from emgs_jax.splitting import SplittingConfig, split
 from emgs_jax.surface_extrapolation import ExtrapolationConfig, extrapolate
 
+Stage = Callable[..., Any]
+
+
+class Stages(NamedTuple):
+    """The functions of a step that can be others: `map_sequence(config, em_update=mine)`.
+
+    Each takes and returns what the one in its place does. A program is compiled for the functions that it is made from.
+    """
+
+    initialize: Stage = initialize
+    localize_coarse: Stage = localize_coarse
+    select_submap: Stage = select_submap
+    find_movers: Stage = find_movers
+    localize_fine: Stage = localize_fine
+    em_update: Stage = em_update
+    split: Stage = split
+    extrapolate: Stage = extrapolate
+    refine: Stage = refine
+    update_existence: Stage = update_existence
+    merge_duplicates: Stage = merge_duplicates
+
 
 class SlamConfig(eqx.Module):
     """All stages.
@@ -67,6 +90,7 @@ class SlamConfig(eqx.Module):
         splitting: of Gaussians that are too coarse for a nearer view.
         existence: evidence of later frames for and against a Gaussian.
         motion: what is taken for moving: it neither aligns a frame nor becomes map.
+        stages: the functions themselves.
     """
 
     window_size: int = static(low=1, high=1000)
@@ -81,11 +105,12 @@ class SlamConfig(eqx.Module):
     refinement: RefinementConfig
     existence: ExistenceConfig
     motion: MotionConfig
+    stages: Stages = eqx.field(static=True, default=Stages())
 
     @property
     def fusion(self) -> "FusionConfig":
         """Settings of the fusion alone: other ones compile it no second time."""
-        return FusionConfig(self.em, self.extrapolation, self.splitting)
+        return FusionConfig(self.em, self.extrapolation, self.splitting, self.stages)
 
 
 class FusionConfig(eqx.Module):
@@ -94,6 +119,7 @@ class FusionConfig(eqx.Module):
     em: EmConfig
     extrapolation: ExtrapolationConfig
     splitting: SplittingConfig
+    stages: Stages = eqx.field(static=True)
 
 
 class SlamState(eqx.Module):
@@ -229,7 +255,9 @@ def init_state(
     Returns:
         The state, and how many Gaussians did not fit into the map's capacity.
     """
-    gaussians, weight, world = initialize(views, T_world_views, camera, config.observation.thin, config.fit)
+    gaussians, weight, world = config.stages.initialize(
+        views, T_world_views, camera, config.observation.thin, config.fit
+    )
     view = downscale(camera, config.observation.thin)
     return _first_state(gaussians, weight, world, T_world_views, view, config)
 
@@ -267,17 +295,17 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
         camera: of the full images.
     """
     view = downscale(camera, config.observation.thin)  # its pixels are an observation's rows
-    num_rows = spacing(camera, config.observation.thin, config.fit)
+    num_rows, stages = spacing(camera, config.observation.thin, config.fit), config.stages
 
     coarse, current, guess, num_left_out = _localize_coarse(
-        prediction, state.previous, state.T_world_previous, state.estimate, view, config.localization
+        prediction, state.previous, state.T_world_previous, state.estimate, view, config.localization, stages
     )
-    submap = _select(state.map, state.previous, guess, config.submap)
-    moving = _find_movers(state.looks, current, state.T_world_previous, coarse, view, config.motion)
-    frame = _localize_fine(current, moving, submap, coarse, state.time, config.localization)
+    submap = _select(state.map, state.previous, guess, config.submap, stages)
+    moving = _find_movers(state.looks, current, state.T_world_previous, coarse, view, config.motion, stages)
+    frame = _localize_fine(current, moving, submap, coarse, state.time, config.localization, stages)
     fused = _fuse(submap, frame, view, num_rows, config.fusion)
     candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
-    refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement)
+    refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement, stages)
     new = NewGaussians(fresh, weight, fused.halves)
     looks, seen = None, None
     if state.looks is not None:
@@ -308,6 +336,7 @@ def _localize_coarse(
     estimate: PoseEstimate,
     view: Camera,
     config: LocalizationConfig,
+    stages: Stages,
 ) -> tuple[CoarsePose, Observation, Observation, Int[Array, ""]]:
     """The coarse pose, the current frame as it is sound and placed by that pose, and how many points it has lost."""
     current, before = sound(prediction.current), sound(prediction.previous)
@@ -320,13 +349,15 @@ def _localize_coarse(
         T_world_anchor=sound_poses(prediction.T_world_anchor),
         pose_covariance=sound_covariances(prediction.pose_covariance),
     )
-    coarse = localize_coarse(prediction, previous, T_world_previous, view, config, estimate)
+    coarse = stages.localize_coarse(prediction, previous, T_world_previous, view, config, estimate)
     return coarse, current, transform(coarse.T_world_camera, current, coarse.scale), num_left_out
 
 
 @executable
-def _select(map: GaussianMap, previous: Observation, guess: Observation, config: SubmapConfig) -> Submap:
-    submap, rows, overflow = select_submap(map, (previous, guess), config)
+def _select(
+    map: GaussianMap, previous: Observation, guess: Observation, config: SubmapConfig, stages: Stages
+) -> Submap:
+    submap, rows, overflow = stages.select_submap(map, (previous, guess), config)
     return Submap(submap, rows, index_of(submap.gaussians), overflow)
 
 
@@ -338,13 +369,14 @@ def _find_movers(
     coarse: CoarsePose,
     view: Camera,
     config: MotionConfig,
+    stages: Stages,
 ) -> Bool[Array, "p"]:
     """What moves in a frame at its coarse pose."""
     if looks is None:
         return jnp.zeros(current.valid.shape, bool)
     points = transform(jaxlie.SE3.identity(), current, coarse.scale)
     T_previous_camera = T_world_previous.inverse() @ coarse.T_world_camera
-    return find_movers(looks, points, T_previous_camera, coarse.estimate, view, config)
+    return stages.find_movers(looks, points, T_previous_camera, coarse.estimate, view, config)
 
 
 @executable
@@ -374,12 +406,13 @@ def _localize_fine(
     coarse: CoarsePose,
     time: Int[Array, ""],
     config: LocalizationConfig,
+    stages: Stages,
 ) -> Frame:
     """The frame at its fine pose, against what is confirmed."""
     target = confirmed(submap.map)
     groups = group_points(target.means, target.valid, order_of(submap.index.groups, target.valid.shape[0]))
     index = GaussianIndex(submap.index.white, groups)
-    T, aligned, localization = localize_fine(_without(current, moving), target, coarse, config, index)
+    T, aligned, localization = stages.localize_fine(_without(current, moving), target, coarse, config, index)
     points = eqx.tree_at(lambda o: o.valid, aligned, aligned.valid | moving & coarse.is_usable)
     return Frame(T, points, localization, time, moving)
 
@@ -389,13 +422,13 @@ def _fuse(submap: Submap, frame: Frame, view: Camera, num_rows: int, config: Fus
     """Fuse the points of a frame that is tracked, and split what they show to be too coarse."""
     T, trusted = frame.T_world_camera, frame.trusted
     noise = frame.localization.noise[:, None] * (trusted.points - T.translation())
-    map, explained, info = em_update(submap.map, trusted, noise, config.em, submap.index)
+    map, explained, info = config.stages.em_update(submap.map, trusted, noise, config.em, submap.index)
     owned = owners(explained, map.birth.shape[0])
     births = take_rows(map.birth, owned).astype(jnp.float32)
     origin = jnp.where(info.num_fused > 0, median(births, explained.is_fused), frame.time).astype(jnp.int32)
-    map, halves = split(map, trusted, noise, owned, num_rows, config.splitting)
+    map, halves = config.stages.split(map, trusted, noise, owned, num_rows, config.splitting)
     explained_by, noise = take_rows(submap.map, owned), frame.localization.noise
-    moved = extrapolate(trusted, explained_by, explained.is_fused, noise, T, view, config.extrapolation)
+    moved = config.stages.extrapolate(trusted, explained_by, explained.is_fused, noise, T, view, config.extrapolation)
     unexplained = eqx.tree_at(lambda o: o.valid, moved, trusted.valid & ~explained.is_fused)
     # The frame was moved onto the map, the mean of W frames: 1 / (W + 1) of what they differ is the map's own error.
     weight = median(explained_by.weight, explained.is_fused)
@@ -413,7 +446,16 @@ def _order(view: Camera) -> Int[Array, "p"]:
     return morton_order(view.height, view.width)
 
 
-_refine = executable(refine)
+@executable
+def _refine(
+    map: GaussianMap,
+    candidates: Gaussians,
+    T_world_camera: jaxlie.SE3,
+    view: Camera,
+    config: RefinementConfig,
+    stages: Stages,
+) -> tuple[GaussianMap, Gaussians, RefinementInfo]:
+    return stages.refine(map, candidates, T_world_camera, view, config)
 
 
 @executable
@@ -433,11 +475,11 @@ def _store(
     """
     rows, T, noise = submap.rows, frame.T_world_camera, frame.localization.depth_noise
     evidence, map = fusion_evidence(map, submap.map, rows), write_back(map, submap.map, rows)
-    map, is_seen = update_existence(map, evidence, Look(frame.seen, T, view, noise), config.existence)
+    map, is_seen = config.stages.update_existence(map, evidence, Look(frame.seen, T, view, noise), config.existence)
     if seen is not None:
         map = take_back(map, seen, view, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)
-    merged = merge_duplicates(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
+    merged = config.stages.merge_duplicates(take_rows(map, rows), is_seen, T.translation(), noise, config.existence)
     born = new_map(new.gaussians, _first_weight(new.weight, config.em.average), config.existence.birth, frame.time)
     born = jax.tree.map(lambda *leaves: jnp.concatenate(leaves), born, new.halves)
     map, _, overflow = insert(write_back(map, merged, rows), born)

@@ -32,7 +32,7 @@ def prepared(camera):
 def test_a_step_after_its_preparation_compiles_nothing(prepared, camera):
     state, config, names = prepared
     # Not `cluster`, which first maps of other files may have asked for.
-    assert {"_localize_coarse", "_select", "_localize_fine", "_fuse", "refine", "_store"} <= set(names)
+    assert {"_localize_coarse", "_select", "_localize_fine", "_fuse", "_refine", "_store"} <= set(names)
     given = predict_room(3, camera, num_features=2), FULL, config
     with compiled() as more:
         advance(state, *given)

@@ -26,8 +26,8 @@ def test_values_of_a_traced_key_share_one_compilation(tmp_path):
         text=True,
     )
     assert done.returncode == 0, done.stderr
-    compiled = re.findall(r"^(?:.* )?Compiling (?:jit\()?(\w+)", done.stderr, re.MULTILINE)
-    for stage in ("_localize_coarse", "_select", "_localize_fine", "_fuse", "refine", "_store"):
+    compiled = re.findall(r"^(?:.* )?Compiling (?:jit\()?(\w+)", done.stdout + done.stderr, re.MULTILINE)
+    for stage in ("_localize_coarse", "_select", "_localize_fine", "_fuse", "_refine", "_store"):
         assert compiled.count(stage) == 1, stage
     keys, rows = read_multirun(tmp_path)
     assert keys == [NOISE] and [row[NOISE] for row in rows] == ["0", "1"]
