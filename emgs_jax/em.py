@@ -55,7 +55,6 @@ class EmConfig(eqx.Module):
     """
 
     num_neighbours: int = static(low=1, high=256)
-    num_candidates: int = static(low=1, high=384)
     min_normal_cos: Float[Array, "*b"] = traced(low=-math.inf, high=1)
     max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
     max_log_gap: Float[Array, "*b"] = traced(low=0, high=math.inf)
@@ -66,8 +65,9 @@ class EmConfig(eqx.Module):
     average: AverageConfig
     feature: Float[Array, "*b"] = choice("medoid", "accumulated")
     noise: Float[Array, "*b"] = traced(low=0)
-    min_responsibility: Float[Array, "*b"] = traced(low=0)
     min_std: Float[Array, "*b"] = traced(low=1e-6, high=1000)
+    num_candidates: int = static(48, low=1, high=384)
+    min_responsibility: Float[Array, "*b"] = traced(1.0, low=0)
 
 
 class EStep(eqx.Module):

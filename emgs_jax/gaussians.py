@@ -78,9 +78,9 @@ class FitConfig(eqx.Module):
 
     points_per_gaussian: int = static(low=1, high=2**20)
     num_fit_neighbours: int = static(low=MIN_ROWS, high=256)
-    num_kmeans_iterations: int = static(low=0, high=1000)
     min_std: Float[Array, "*b"] = traced(low=1e-6, high=1000)
     feature: Float[Array, "*b"] = choice("medoid", "accumulated")
+    num_kmeans_iterations: int = static(5, low=0, high=1000)
 
 
 def spacing(camera: Camera, thin: int, config: FitConfig) -> int:

@@ -83,16 +83,16 @@ class LocalizationConfig(eqx.Module):
     coarse: Float[Array, "*b"] = choice(*COARSE)
     coarse_scale: Float[Array, "*b"] = choice("none", "ratio", "estimated")
     scale_std: Float[Array, "*b"] = traced(low=1e-4, high=math.inf)
-    max_pair_distance: Float[Array, "*b"] = traced(low=0, high=math.inf)
     pose_shared: Float[Array, "*b"] = traced(low=0, high=1)
     num_alike: Float[Array, "*b"] = traced(low=1, high=math.inf)
     num_shared: Float[Array, "*b"] = traced(low=1, high=math.inf)
     icp: IcpConfig
-    min_inlier_fraction: Float[Array, "*b"] = traced(low=0, high=1)
-    max_residual: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    max_step: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    max_step_rad: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    max_pose_std: Float[Array, "*b"] = traced(low=0, high=math.inf)
+    max_pair_distance: Float[Array, "*b"] = traced(0.05, low=0, high=math.inf)
+    min_inlier_fraction: Float[Array, "*b"] = traced(0.1, low=0, high=1)
+    max_residual: Float[Array, "*b"] = traced(0.05, low=0, high=math.inf)
+    max_step: Float[Array, "*b"] = traced(0.15, low=0, high=math.inf)
+    max_step_rad: Float[Array, "*b"] = traced(0.3, low=0, high=math.inf)
+    max_pose_std: Float[Array, "*b"] = traced(0.1, low=0, high=math.inf)
 
 
 class CoarsePose(eqx.Module):

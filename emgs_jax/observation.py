@@ -79,10 +79,10 @@ class ObservationConfig(eqx.Module):
     """
 
     thin: int = static(low=1, high=64)
-    normal_radius: int = static(low=1, high=64)
-    normal_spacing: int = static(low=1, high=64)
-    max_depth_step: Float[Array, "*b"] = traced(low=0, high=math.inf)
-    min_confidence: Float[Array, "*b"] = traced(low=0)
+    normal_radius: int = static(4, low=1, high=64)
+    normal_spacing: int = static(2, low=1, high=64)
+    max_depth_step: Float[Array, "*b"] = traced(0.05, low=0, high=math.inf)
+    min_confidence: Float[Array, "*b"] = traced(1.0, low=0)
 
 
 def normals_from_pointmap(

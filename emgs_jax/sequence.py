@@ -6,17 +6,16 @@ from typing import Any
 from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
+from tqdm import tqdm
 
 from emgs_jax.back_end.saved_map import load_saved_map
 from emgs_jax.back_end.state import BackEndConfig
 from emgs_jax.config.configure import build, build_dataset, build_prior, compose, graph_config, message_of
 from emgs_jax.device.clock import Clock
-from emgs_jax.device.compilation import compiling
 from emgs_jax.device.settings import use_compilation_cache
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
-from emgs_jax.io.bar import Bar
 from emgs_jax.mapping.pipeline import finish_run, map_frames
-from emgs_jax.mapping.records import show_records
+from emgs_jax.mapping.records import COMPILING, show_records
 from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.slam import SlamConfig
@@ -75,8 +74,9 @@ def map_sequence(config: RunConfig, show_progress: bool = True) -> MappingRun:
     )
     with (
         Clock().watching() as clock,
-        Bar(total=len(dataset), unit="frame", desc="mapping", disable=not show_progress, doing=compiling) as bar,
+        tqdm(total=len(dataset), unit="frame", desc="mapping", disable=not show_progress) as bar,
     ):
+        bar.set_postfix_str(COMPILING)
         run = start = new_run(dataset, config.slam, clock, graph=config.graph, saved=saved)
         for run, new, _ in map_frames(start, dataset, prior):
             show_records(bar, run.records, len(new))

@@ -9,8 +9,8 @@ from .console import speak_on
 from .interrupt import clear_interrupt
 
 COMMANDS = (
-    *("run", "evaluate", "score", "sweep", "tune", "effects", "report", "polish", "merge", "view"),
-    *("export", "predict", "embed", "query", "segment", "tables", "benchmark"),
+    *("run", "evaluate", "score", "report", "polish", "merge", "view"),
+    *("export", "predict", "embed", "query", "segment"),
 )
 
 

@@ -165,7 +165,7 @@ def check_arguments(name: str, arguments: list[str]) -> None:
         parsed = OverridesParser.create().parse_overrides([word for word in given.overrides if "=" in word])
     except HydraException as error:
         raise ValueError(f"{str(error).splitlines()[0]}: write each as KEY=VALUE, in quotes: 'KEY=VALUE'") from error
-    # Of Hydra's own keys one has options of the user in it: what emgs tune has found.
+    # Of Hydra's own keys one has options of the user in it.
     own = [o for o in parsed if not o.key_or_group.startswith("hydra") or o.key_or_group == "hydra.searchpath"]
     for override in parsed:
         run = str(override.value())

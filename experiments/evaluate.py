@@ -24,8 +24,9 @@ from emgs_jax.config.overrides import quoted, written
 from emgs_jax.config.values import check_values
 from emgs_jax.io.files import check_writable, write_file, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
-from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
+from emgs_jax.report.gate import TOLERANCES, read_gate, regressions, rounding_tolerances, write_gate
 from emgs_jax.report.provenance import code_now, code_of
+from emgs_jax.report.published import published
 from emgs_jax.report.results import METRICS_FILE, is_finished, read_estimates, read_metrics, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
 
@@ -33,6 +34,7 @@ from .command import command, overrides_of
 from .run import run
 
 ERROR_FILE = "error.txt"
+SEQUENCE = "dataset.sequence"  # key of the runs that the sequences of a suite are values of, unless it names another
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
             own, changed = (
                 [f"{key}={written(value)}" for key, value in some.items()] for some in (data["overrides"], changes)
             )
-            _check_free([*settings["overrides"], *changed], dataset, data["key"])
+            _check_free([*settings["overrides"], *changed], dataset, data.get("key", SEQUENCE))
             overrides = [f"dataset={dataset}", *own, *settings["overrides"], *changed]
             common = compose(*overrides)
             has_seed = "seed" in common.prior
@@ -61,7 +63,7 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
             for sequence in data["sequences"]:
                 for seed in settings["seeds"]:
                     config = copy.deepcopy(common)
-                    OmegaConf.update(config, data["key"], sequence)
+                    OmegaConf.update(config, data.get("key", SEQUENCE), sequence)
                     if has_seed:
                         config.prior.seed = seed
                     for part in config:
@@ -125,11 +127,11 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
     try:
         _run_all(open_jobs, failures)
     finally:
-        rows, found = _write_tables(out, jobs, failures, settings["published"])
+        rows, found = _write_tables(out, jobs, failures)
         worse = regressions(baseline, rows)
         write_evaluation_page(out, found._replace(gate=settings["gate"], regressions=worse), command_line)
     if settings["write_gate"]:
-        tolerances = settings["tolerances"]
+        tolerances = TOLERANCES | settings["tolerances"]
         if settings["rounded"]:
             rounded = read_estimates(Path(settings["rounded"]))
             tolerances = rounding_tolerances(tolerances, read_estimates(out), rounded, len(settings["seeds"]))
@@ -170,9 +172,7 @@ def _shard(text: str) -> tuple[int, int]:
     return int(part), int(whole)
 
 
-def _write_tables(
-    out: Path, jobs: Sequence[Job], failures: Mapping[str, str], published: Sequence[Mapping[str, Any]]
-) -> tuple[list[Row], Found]:
+def _write_tables(out: Path, jobs: Sequence[Job], failures: Mapping[str, str]) -> tuple[list[Row], Found]:
     """Write results.csv, results.json and results.md; returns the rows by sequence, and what the page shows.
 
     They show the jobs of this evaluation and other systems: older results in `out` may have other settings.
@@ -182,14 +182,15 @@ def _write_tables(
     totals, rows = average(estimates, each_sequence=False), average(estimates, each_sequence=True)
     done = {item.folder for item in estimates}
     missing = {job.name: failures.get(job.name, "to do") for job in jobs if job.folder not in done}
-    parts, shown = [paper_table(totals, published)], [*rows, *(row for row in totals if len(row.sequences) > 1)]
+    quoted = published("reconstruction")
+    parts, shown = [paper_table(totals, quoted)], [*rows, *(row for row in totals if len(row.sequences) > 1)]
     parts.append(full_table(shown) if rows else "")
     parts.append("".join(f"- not finished: {name}: {reason}\n" for name, reason in missing.items()))
     text = "\n".join(part for part in parts if part)
     out.mkdir(parents=True, exist_ok=True)
     for name, content in (("results.csv", to_csv(estimates)), ("results.md", text)):
         write_file(out / name, content)
-    write_json(out / "results.json", {"rows": rows, "totals": totals, "published": published, "missing": missing})
+    write_json(out / "results.json", {"rows": rows, "totals": totals, "published": quoted, "missing": missing})
     print(text)
     lines = [JobLine(job.name, job.folder, missing.get(job.name, "")) for job in jobs]
     return rows, Found(lines, shown, estimates)

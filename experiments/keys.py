@@ -28,7 +28,9 @@ class SegmentKeys:
     """`conf/segment.yaml`."""
 
     map: str | Sequence[str]
+    ignored: Sequence[str]
     with_scale: bool
+    num_neighbours: int = number(low=1, high=1000)
     alignment: str = one_of("trajectory", "points")
     icp_distance_m: float = number(low=1e-6)
     icp_max_steps: int = number(low=0, high=10000)

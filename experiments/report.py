@@ -1,12 +1,15 @@
-"""Write the page of a run anew: `python -m experiments.report FOLDER`; a run writes it at its end by itself."""
+"""Write the page of a run anew, or one table of many runs: `python -m experiments.report FOLDER`."""
 
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from emgs_jax.io.files import check_writable
+from emgs_jax.report.columns import aligned
 from emgs_jax.report.finished_run import read_run
+from emgs_jax.report.multirun import runs_of, write_multirun
 from emgs_jax.report.page import write_report
+from emgs_jax.report.results import METRICS_FILE
 from emgs_jax.report.run_images import images_of
 
 from .command import command, first_words
@@ -22,10 +25,19 @@ def report(folder: Path) -> Path:
     return path
 
 
+def tabulate(folder: Path) -> None:
+    """Print and write the table of the runs below a folder."""
+    check_writable(folder, f"folder={folder}")
+    print(aligned(write_multirun(folder)))
+    print(f"{folder / 'runs.md'} has this table, {folder / 'runs.csv'} all metrics")
+
+
 @command("report", first_words("folder"))
 def main(config: DictConfig) -> None:
-    """Write the page, and say where it is."""
-    report(Path(str(config.folder)))
+    """Write the page of a run, or the table of a folder of runs."""
+    folder = Path(str(config.folder))
+    is_multirun = not (folder / METRICS_FILE).exists() and bool(runs_of(folder))
+    tabulate(folder) if is_multirun else report(folder)
 
 
 if __name__ == "__main__":

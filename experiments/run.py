@@ -16,16 +16,14 @@ from emgs_jax.config.configure import baseline_configs, build, build_dataset, bu
 from emgs_jax.config.values import check_values
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
-from emgs_jax.device.compilation import compiling
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
-from emgs_jax.io.bar import Bar
 from emgs_jax.io.files import FrameLog, owned
 from emgs_jax.io.packages import extra
 from emgs_jax.mapping.capacity import prepared_beside
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.mapping.convert import to_camera
 from emgs_jax.mapping.pipeline import finish_run, map_frames
-from emgs_jax.mapping.records import FrameRecord, show_records, to_line
+from emgs_jax.mapping.records import COMPILING, FrameRecord, show_records, to_line
 from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
@@ -136,10 +134,10 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _said(clock: Clock, phase: str, words: str) -> Iterator[None]:
-    """A phase of a run that says what it does before it does it, and for how long; no words, no line."""
+    """A phase of a run that says what it does before it does it; no words, no line."""
     if words:
         tqdm.write(f"{words} …")
-    with clock.phase(phase), Bar(bar_format="  {elapsed}{postfix}", leave=False, disable=not words, doing=compiling):
+    with clock.phase(phase):
         yield
 
 
@@ -158,8 +156,9 @@ def _map(
     run, (baselines, evaluation, keeps_points) = start, compared
     with (
         FrameLog(folder / "frames.jsonl") as log,
-        Bar(total=len(dataset), unit="frame", desc="mapping", doing=compiling) as bar,
+        tqdm(total=len(dataset), unit="frame", desc="mapping") as bar,
     ):
+        bar.set_postfix_str(COMPILING)
 
         def frames() -> Iterator[tuple[FrameRecord, RawView]]:
             nonlocal run

@@ -8,13 +8,13 @@ from typing import Any
 
 from omegaconf import DictConfig, ListConfig
 
-from emgs_jax.config.configure import build
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.evaluation.segmentation import LabelledPoints, TrueLabels, read_labelled_mesh
 from emgs_jax.io.files import write_file, write_json
 from emgs_jax.report.finished_run import FinishedRun, read_run
+from emgs_jax.report.published import published
 from emgs_jax.report.run_images import images_of
-from emgs_jax.report.segmentation_table import Placement, SceneResult, score_scene, summary, table
+from emgs_jax.report.segmentation_table import PROTOCOL, Counting, Placement, SceneResult, score_scene, summary, table
 from emgs_jax.report.vocabulary import feature_model, vocabulary
 
 from .command import command
@@ -24,7 +24,7 @@ FRAMES = "frames"  # the word that takes the labels of the data set's own frames
 
 def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
     """Score the maps of `config` and write file and table; returns both."""
-    protocol = build(config, "protocol", _convert_="all")
+    counting = Counting(config.num_neighbours, tuple(config.ignored))
     how = Placement(config.alignment, config.with_scale, config.icp_distance_m, config.icp_max_steps)
     runs = [read_run(Path(str(folder))) for folder in (config.map if _is_list(config.map) else [config.map])]
     scenes = scene_names(config, runs)
@@ -39,11 +39,11 @@ def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
             raise ValueError(f"{run.folder} has other classes than {runs[0].folder}: score them by themselves")
         classes = truth.classes
         text = vocabulary(run, config.features.text, feature_model(config, classes)).embed(classes)
-        results.append(score_scene(run, scene, truth, text.vectors, how, protocol))
-    found = summary(results, classes, protocol, how) | {"truth": str(config.truth), "templates": text.templates}
-    said = table(found, config.table_iii)
-    write_json(Path(config.out) / f"segmentation_{protocol.name}.json", found)
-    write_file(Path(config.out) / f"segmentation_{protocol.name}.md", said)
+        results.append(score_scene(run, scene, truth, text.vectors, how, counting))
+    found = summary(results, classes, counting, how) | {"truth": str(config.truth), "templates": text.templates}
+    said = table(found, published("segmentation"))
+    write_json(Path(config.out) / f"segmentation_{PROTOCOL}.json", found)
+    write_file(Path(config.out) / f"segmentation_{PROTOCOL}.md", said)
     return found, said
 
 

@@ -5,9 +5,9 @@ from functools import cache
 import hydra
 import numpy as np
 from omegaconf import OmegaConf
-from scene import CONF
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.config.schema import schema_of
 from emgs_jax.loop_closure.place_recognition import BYTES_PER_UNIT, Keyframe, PlaceRecognitionConfig
 from emgs_jax.loop_closure.verification import Neighbour, VerificationConfig
 
@@ -16,9 +16,9 @@ SIZE, INTRINSICS = (320, 240), (250.0, 260.0, 155.0, 122.5)
 
 @cache
 def loops_config(*overrides: str) -> dict:
-    """What conf/graph/default.yaml says of loops, changed by words like `place_recognition.min_gap=5`."""
+    """What graph=default says of loops, changed by words like `place_recognition.min_gap=5`."""
     parts = ["place_recognition", "verification", "consistency", "prior_query", "relocalization"]
-    given = OmegaConf.masked_copy(OmegaConf.load(CONF / "graph" / "default.yaml"), parts)
+    given = OmegaConf.masked_copy(OmegaConf.create(schema_of("graph/schema")), parts)
     config = OmegaConf.merge(given, OmegaConf.from_dotlist(list(overrides)))
     return hydra.utils.instantiate(config, _convert_="all")
 

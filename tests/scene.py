@@ -12,6 +12,7 @@ import numpy as np
 from reference import room_view
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.config import configure
 from emgs_jax.em import EStep
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
@@ -52,8 +53,7 @@ WHOLE = (
 @cache
 def compose(*overrides: str):
     """conf/ with overrides, as Hydra composes it."""
-    with hydra.initialize_config_dir(version_base=None, config_dir=str(CONF)):
-        return hydra.compose("config", overrides=list(overrides))
+    return configure.compose(*overrides)
 
 
 @cache

@@ -142,7 +142,7 @@ def test_the_mapping_does_not_read_its_log():
     """Records are written from events and from the pose graph, by the files that run a sequence."""
     log, mapping = {"mapping.records", "mapping.run"}, (PACKAGE / "mapping").glob("*.py")
     readers = {path.stem for path in mapping if inner(path) & log}
-    assert readers == {"run", "pipeline", "checkpoint", "batch"}
+    assert readers == {"run", "pipeline", "checkpoint"}
 
 
 def test_no_two_files_of_tests_share_a_name():

@@ -19,7 +19,7 @@ from experiments.evaluate import delegated
 
 ROOT = CONF.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
-GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "sweep", "tune", "protocol")
+GROUPS = ("dataset", "prior", "features", "evaluation", "experiment", "suite", "protocol")
 
 BLOCK = re.compile(r"^```\w*\n(.*?)^```", re.DOTALL | re.MULTILINE)
 

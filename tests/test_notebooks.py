@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from listening import compiled
 from scipy.spatial.transform import Rotation
 from tiny_run import TINY
 
@@ -16,10 +17,10 @@ pytestmark = pytest.mark.xdist_group("tiny")
 
 NOTEBOOKS = sorted((Path(__file__).resolve().parents[1] / "notebooks").glob("*.ipynb"))
 IDS = [path.stem for path in NOTEBOOKS]
-AXES = "grid=one_at_a_time axes={slam.em.support:[printed,normalized],slam.em.noise:[0.0,1.0]}"
-MUTE = "slam.em.feature_weight=0.0 slam.refinement.cosine_weight=0.0 axes={slam.em.feature_weight:[0.0,20.0]}"
+READINGS = "slam.em.support=printed slam.em.noise=0"
+MUTE = "slam.em.feature_weight=0.0 slam.refinement.cosine_weight=0.0"
 MAX_BYTES = 300_000
-GRID = "axes={slam.em.max_mahalanobis_sq:[4.0,25.0],slam.em.max_log_gap:[3.0,inf]}"
+EM_GATES = "max_mahalanobis_sq", "max_log_gap"
 
 
 def cells(path: Path) -> list[dict]:
@@ -90,28 +91,29 @@ def test_one_step_taken_apart_is_the_step(monkeypatch, tmp_path):
 
 
 @pytest.mark.weekly
-def test_the_readings_are_compared_seed_by_seed_and_loaded_when_run_again(monkeypatch, tmp_path):
-    found = execute(2, " ".join((*TINY, AXES)), monkeypatch, tmp_path)
-    changes = [(effect.key, effect.value) for effect in found["effects"]]
-    assert changes == [(None, None), ("slam.em.support", "printed"), ("slam.em.noise", 0.0)]
-    first, second = (rows[1]["trajectory/ate_sim3_m"] - rows[0]["trajectory/ate_sim3_m"] for rows in found["rows"])
-    assert found["effects"][1].metrics["trajectory/ate_sim3_m"] == [first, second] and first != second
-    monkeypatch.setattr("emgs_jax.experiments.together.map_and_score", None)  # calling it would fail
-    assert table_of(execute(2, " ".join((*TINY, AXES)), monkeypatch, tmp_path)) == table_of(found)
-
-
-def table_of(variables: dict) -> str:
-    return variables["table"](variables["effects"])
+def test_the_readings_are_compared_seed_by_seed(monkeypatch, tmp_path):
+    monkeypatch.setenv("NOTEBOOK_READINGS", READINGS)
+    found = execute(2, " ".join(TINY), monkeypatch, tmp_path)
+    assert {word for word, _ in found["rows"]} == {"", *READINGS.split()}
+    ate = found["values"]("slam.em.noise=0", "trajectory/ate_sim3_m") - found["values"]("", "trajectory/ate_sim3_m")
+    assert len(np.unique(ate)) == 3
+    shown = found["line"]("slam.em.noise=0", True)[1]
+    assert shown == f"{100 * ate.mean():+.2f} ± {100 * ate.std(ddof=1):.2f}"
 
 
 @pytest.mark.weekly
-def test_the_heat_maps_show_the_metrics_of_each_setting_at_its_place(monkeypatch, tmp_path):
-    found = execute(3, " ".join((*TINY, GRID)), monkeypatch, tmp_path)
-    drawn = found["values"]("trajectory/ate_sim3_m")
-    for row in found["rows"]:
-        place = [4.0, 25.0].index(row["slam.em.max_mahalanobis_sq"]), [3.0, "inf"].index(row["slam.em.max_log_gap"])
-        assert drawn[place] == row["trajectory/ate_sim3_m"]
-    assert len(np.unique(drawn)) == 4
+def test_the_heat_maps_show_the_metrics_of_each_setting_at_its_place_and_all_share_a_program(monkeypatch, tmp_path):
+    with compiled() as names:
+        found = execute(3, " ".join(TINY), monkeypatch, tmp_path)
+    assert names.count("_fuse") <= 1  # 0 where another test needed it, too
+    drawn, folder = found["values"]("trajectory/ate_sim3_m"), tmp_path / "outputs" / "threshold_sweep"
+    for number, place in enumerate(np.ndindex(drawn.shape)):
+        metrics = json.loads((folder / str(number) / "metrics.json").read_text())
+        em = metrics["provenance"]["config"]["slam"]["em"]
+        values = [found["axes"][f"slam.em.{key}"][at] for key, at in zip(EM_GATES, place, strict=True)]
+        assert [em[key] if em[key] is not None else np.inf for key in EM_GATES] == values
+        assert drawn[place] == metrics["trajectory/ate_sim3_m"]
+    assert len(np.unique(drawn)) > 4
 
 
 @pytest.mark.weekly
@@ -132,6 +134,7 @@ def test_own_images_become_a_map_of_the_room_that_they_show(monkeypatch, tmp_pat
 @pytest.mark.weekly
 def test_wrong_features_cost_classes_and_move_geometry_only_where_they_have_a_weight(monkeypatch, tmp_path):
     """Oracle: where nothing looks at features but the layers' sign, wrong ones move nothing but that."""
+    monkeypatch.setenv("NOTEBOOK_CHANGES", "slam.em.feature_weight=20")
     # The prior is exact: 1 cm of error over 40 cm of path turns a noisy map until classes fall beside their things.
     found = execute(5, " ".join((*TINY, MUTE, "prior.level=0.0")), monkeypatch, tmp_path)
     shares, seeds, rows = found["shares"], found["seeds"], found["rows"]

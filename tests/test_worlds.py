@@ -137,7 +137,7 @@ def polished(world: World, map, poses: np.ndarray, folder: Path) -> tuple[list, 
     pytest.importorskip("optax", reason="the extra of emgs polish: pip install -e .[polish]")
     words = "polish.loss.render.tile_size=16", "polish.steps=4", "polish.pixels_per_splat=4"
     settings = build(configure.compose("folder=x", *words, name="polish"), "polish")
-    drawing = DensifyConfig(0.05, 0.3, 0.01 * world.size, sc.slam_config(*WHOLE).refinement.render, "map")
+    drawing = DensifyConfig(min_std=0.01 * world.size, render=sc.slam_config(*WHOLE).refinement.render, points="map")
     seeds, targets, rng, views = Seeds(THINNED, settings.pixels_per_splat), Spool(), np.random.default_rng(0), []
     for pose in poses:
         views += [densified(map, sc.pose_of(pose), drawing)]

@@ -224,7 +224,7 @@ def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFra
         tqdm.write(dataset.calibration["note"])
     progress = partial(tqdm, desc="checking", unit="frame")
     masks = build(config, "masks", _convert_="all") if "masks" in config else Masks()
-    frames = ReadableFrames(dataset, config.on_bad_frame, config.checksums, progress, masks)
+    frames = ReadableFrames(dataset, config.on_bad_frame, progress, masks)
     if "depth_scale" in config.dataset:  # files of depths; None: the data set knows
         scale = config.dataset.depth_scale
         check_truth(frames, None if scale is None else float(scale))

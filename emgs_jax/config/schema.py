@@ -24,6 +24,8 @@ SCHEMAS = {
     "baseline/of_tsdf": "emgs_jax.evaluation.baselines.TsdfConfig",
     "baseline/of_voxels": "emgs_jax.evaluation.baselines.VoxelConfig",
     "evaluation/schema": "emgs_jax.evaluation.reconstruction.EvaluationConfig",
+    "features/files": "emgs_jax.features.checkpoint.DinoFiles",
+    "features/image": "emgs_jax.features.images.ImageConfig",
     "graph/schema": "emgs_jax.back_end.state.BackEndConfig",
     "polish/schema": "emgs_jax.polish.fit.PolishConfig",
     "prior/compute": "emgs_jax.prior.network.framework.ComputeConfig",
@@ -33,10 +35,14 @@ SCHEMAS = {
     "prior/dense/of_meter": "emgs_jax.prior.multiview.monocular_network.MeterConfig",
     "prior/dense/of_network": "emgs_jax.prior.multiview.learned.LearnedConfig",
     "prior/dense/of_sweep": "emgs_jax.prior.multiview.swept.SweptConfig",
+    "slam/em/schema": "emgs_jax.em.EmConfig",
     "slam/existence/schema": "emgs_jax.existence.ExistenceConfig",
     "slam/extrapolation/schema": "emgs_jax.surface_extrapolation.ExtrapolationConfig",
+    "slam/fit/schema": "emgs_jax.gaussians.FitConfig",
     "slam/localization/icp": "emgs_jax.registration.problem.IcpConfig",
+    "slam/localization/schema": "emgs_jax.localization.LocalizationConfig",
     "slam/motion/schema": "emgs_jax.motion.MotionConfig",
+    "slam/observation/schema": "emgs_jax.observation.ObservationConfig",
     "slam/splitting/schema": "emgs_jax.splitting.SplittingConfig",
 }
 

@@ -10,7 +10,6 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
-from emgs_jax.data.checksums import find_checksums
 from emgs_jax.data.masks import Masks, masked, names_of
 from emgs_jax.data.spool import Spool
 
@@ -28,8 +27,6 @@ class ReadableFrames:
         dataset: all frames.
         on_bad_frame: `error`: a frame that cannot be read ends the run when it is its turn, a true pose that cannot
             be read at once; `skip`: all frames are read once here, and those that cannot be read are left out.
-        checksums: of the files of the frames: `auto`, a file or `off`, see `find_checksums`. A file that is not the
-            listed one is a frame that cannot be read.
         progress: wraps the frame numbers of that first pass, e.g. tqdm.
         masks: of the frames; what they leave out has no truth either.
 
@@ -42,13 +39,12 @@ class ReadableFrames:
         self,
         dataset: Dataset,
         on_bad_frame: str = "error",
-        checksums: str | None = "off",
         progress: Callable[[Iterable[int]], Iterable[int]] = iter,
         masks: Masks = Masks(),  # noqa: B008 (it is frozen)
     ) -> None:
         if on_bad_frame not in ("error", "skip"):
             raise ValueError(f"on_bad_frame must be error or skip, got {on_bad_frame!r}")
-        self._dataset, self._checksums = dataset, find_checksums(checksums, dataset)
+        self._dataset = dataset
         self._spool, self._places = Spool(), {}  # of each frame that was read, the rest of it and where its arrays are
         for name in ("name", "sequence", "size", "intrinsics", "calibration", "classes", "has_ground_truth"):
             setattr(self, name, getattr(dataset, name))
@@ -79,9 +75,6 @@ class ReadableFrames:
         if index in self._places:
             frame, places = self._places[index]
             return replace(frame, **{name: self._spool[place] for name, place in places.items()})
-        if self._checksums is not None:
-            for file in self._dataset.files(index):
-                self._checksums.check(file)
         frame = self._dataset[index]
         if self._masks.folder is not None:
             frame = masked(frame, self._masks.read(self._names[index], self.size))

@@ -22,10 +22,10 @@ class DinoFiles:
         vocabulary: of CLIP.
     """
 
-    vision_head: str
-    text_encoder: str
-    vocabulary: str
-    source: str
+    vision_head: str = "dinov3_vitl16_dinotxt_vision_head_and_text_encoder-a442d8f5.pth"
+    text_encoder: str = "dinov3_vitl16_dinotxt_vision_head_and_text_encoder-a442d8f5.pth"
+    vocabulary: str = "bpe_simple_vocab_16e6.txt.gz"
+    source: str = "facebook/dinov3-vitl16-pretrain-lvd1689m on Hugging Face and facebookresearch/dinov3 on GitHub"
 
 
 def require(folder: str, names: Sequence[str], source: str) -> list[Path]:

@@ -18,9 +18,9 @@ class ImageConfig:
         mean: of RGB in [0, 1], subtracted.
     """
 
-    long_side: int = number(low=1, high=65536)
-    mean: Sequence[float]
-    std: Sequence[float]
+    long_side: int = number(640, low=1, high=65536)
+    mean: Sequence[float] = (0.485, 0.456, 0.406)
+    std: Sequence[float] = (0.229, 0.224, 0.225)
 
 
 def grid_size(size: tuple[int, int], patch: int, long_side: int) -> tuple[int, int]:

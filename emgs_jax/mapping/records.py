@@ -314,6 +314,9 @@ def _last_row(records: Sequence[FrameRecord], most: int) -> Sequence[FrameRecord
     return records[len(records) - count :]
 
 
+COMPILING = "compiling"  # of a progress bar before its first record
+
+
 def show_records(bar: tqdm, records: Sequence[FrameRecord], num_new: int) -> None:
     """Advance the progress bar by the new records and print an alarm where many frames in a row are untracked."""
     for count in range(len(records) - num_new + 1, len(records) + 1):

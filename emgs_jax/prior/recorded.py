@@ -12,7 +12,7 @@ The format `emgs_jax.predictions`, version 3, is a folder; nothing in it is ever
 - `000000.npz`, …, one file per inference: `inference` (), `views` (v,), `dense` (d,), `current` () and the arrays of
   `PriorPrediction` in the dtypes stated there, `pose_covariance`, `scale_std` and `world` only where the prior gives
   them: about d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are not, because a float16
-  step is 2 mm at 2 to 4 m. Versions 1, whose features have one cell per pixel, and 2, without these two, are read, too.
+  step is 2 mm at 2 to 4 m.
 
 Each file is written under a temporary name and then renamed, data before the manifest: a full disk or an interrupted
 run leaves a valid folder, which `record` completes.
@@ -44,7 +44,7 @@ from emgs_jax.prior.base import (
     with_frames,
 )
 
-FORMAT, VERSION, READABLE = "emgs_jax.predictions", 3, (1, 2, 3)
+FORMAT, VERSION = "emgs_jax.predictions", 3
 WINDOW = ("inference", "views", "dense", "current")
 COMPLETE = "`python -m experiments.predict`, called as for the others, makes what is missing or damaged"
 REMEDY = "record into another folder with `python -m experiments.predict`"
@@ -295,8 +295,8 @@ def _read_manifest(folder: Path) -> dict:
         raise ValueError(f"{path} is damaged ({error}): {REMEDY}") from error
     if not isinstance(manifest, dict) or manifest.get("format") != FORMAT:
         raise ValueError(f"{path} is not of the format {FORMAT}: {REMEDY}")
-    if manifest.get("version") not in READABLE:
-        raise ValueError(f"{path} has version {manifest.get('version')}, this program reads {READABLE}: {REMEDY}")
+    if manifest.get("version") != VERSION:
+        raise ValueError(f"{path} has version {manifest.get('version')}, this program reads {VERSION}: {REMEDY}")
     if manifest.pop("sha256", None) != _digest(manifest):
         raise ValueError(f"{path} is damaged (its SHA-256 does not fit): {REMEDY}")
     check_manifest(path, manifest)

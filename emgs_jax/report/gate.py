@@ -14,6 +14,16 @@ from emgs_jax.report.results import Estimate, sound
 from emgs_jax.report.tables import Row
 
 GATE_FORMAT = 1
+# By how much a metric of a new baseline may get worse, at least; which direction is better.
+TOLERANCES = {
+    "trajectory/ate_sim3_m": {"direction": "lower", "tolerance": 0.005},
+    "trajectory/ate_se3_m": {"direction": "lower", "tolerance": 0.005},
+    "reconstruction/accuracy_m": {"direction": "lower", "tolerance": 0.005},
+    "reconstruction/completion_m": {"direction": "lower", "tolerance": 0.005},
+    "reconstruction/f1_20cm_percent": {"direction": "higher", "tolerance": 1.0},
+    "reconstruction/f1_5cm_percent": {"direction": "higher", "tolerance": 3.0},
+    "reconstruction/normals_abs_cos_percent": {"direction": "higher", "tolerance": 2.0},
+}
 _DEVIATIONS = 4.0  # of what rounding does to a mean: a baseline is compared with on other machines
 _FEWEST_PAIRS = 5
 

@@ -193,7 +193,7 @@ def _origin(parts: Sequence[FinishedRun], has_truth: bool) -> tuple[dict[str, An
     settings = OmegaConf.to_container(OmegaConf.create(dict(first["config"])), resolve=True)
     images = {"_target_": OmegaConf.load(CONF / "merge.yaml").dataset["_target_"], "has_truth": has_truth}
     images |= {"runs": [str(one.folder.resolve()) for one in parts]}
-    settings |= {"dataset": images, "map": None, "on_bad_frame": "error", "checksums": "off"}
+    settings |= {"dataset": images, "map": None, "on_bad_frame": "error"}
     settings["densify"] |= {"points": "map"}  # those of the frames are not kept
     settings["masks"] |= {"folder": None}  # each run has its own
     try:

@@ -1,7 +1,7 @@
 """metrics.json of a run: the map against the truth, the prior alone against the truth, counts and times."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
@@ -38,11 +38,8 @@ from emgs_jax.geometry import scale_pose
 from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, FrameRecord, longest_row, records_apart
 from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
-from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.back_end import counts, found_loops
-from emgs_jax.report.dense import center_cloud, dense_map
 from emgs_jax.report.gathering import Baselines, RawPrior, Text
-from emgs_jax.report.labelling import labelled_map
 from emgs_jax.report.provenance import RAW_PRIOR, prefixed
 
 Metrics = dict[str, Any]
@@ -170,27 +167,6 @@ def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer
             found = score_cloud(fusion.cloud(), compared, scorer) | rendered.metrics()
             metrics |= prefixed(found, f"baseline_{name}_{kind}/")
     return metrics
-
-
-def score_settings(
-    runs: Sequence[MappingRun], raw: RawPrior, densify: Sequence[DensifyConfig], scorer: Scorer, num_threads: int
-) -> list[Metrics]:
-    """The metrics.json of every finished run, without times; what the prior alone says is the same for all."""
-
-    def score(run: MappingRun, config: DensifyConfig) -> Metrics:
-        counts = {k: v for k, v in describe(run, scorer.dataset).items() if not k.startswith("time/")}
-        if all(pose is None for pose in run.true_poses):
-            return counts
-        labelled = labelled_map(run, scorer.prior)
-        dense = dense_map(run, scorer.dataset, config, scorer.evaluation, labelled, 0, raw.points)
-        labels = None if labelled is None else labelled.centers
-        return score_map(run, dense.cloud, center_cloud(run), labels, scorer) | dense.rendering | counts
-
-    with ThreadPoolExecutor(num_threads) as threads:
-        shared = threads.submit(score_prior, runs[0], raw, scorer)
-        found = [score(runs[0], densify[0])]  # by itself: what it compiles is there for the others
-        found += threads.map(score, runs[1:], densify[1:])
-    return [metrics | shared.result() for metrics in found]
 
 
 def describe(run: MappingRun, dataset: ReadableFrames | None = None) -> Metrics:

@@ -10,11 +10,10 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from matplotlib.patheffects import withStroke
-from PIL import Image, ImageDraw
 
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.geometry import rotated
-from emgs_jax.report.colors import OURS, PATHS, class_colors, save_figure, to_bytes
+from emgs_jax.report.colors import OURS, PATHS, class_colors, save_figure
 
 _INK, _PAPER = "#333333", "#e3e6ea"
 
@@ -130,38 +129,6 @@ def seen_from_above(
     cell = size / np.clip(1.2 * np.sqrt(seen.sum()), *cells)
     image, extent = paint_from_above(points[seen], colors[seen], cell)
     return fill_holes(image), extent
-
-
-def thumbnail(points: np.ndarray, colors: np.ndarray, poses: np.ndarray, width: int = 240) -> Image.Image:
-    """Draw a small picture of a map from above with its path; `width` is the longer side.
-
-    Points (n, 3), with RGB (n, 3) in [0, 1], are in the frame of the poses T_world_camera (f, 4, 4); those that are not
-    finite are left out.
-    """
-    rotation = view_from_above(poses)
-    path, finite = poses[:, :3, 3] @ rotation.T, np.isfinite(points).all(1)
-    if not finite.any():
-        return Image.new("RGB", (width, width), _PAPER)
-    picture, (left, right, bottom, top) = seen_from_above(
-        points[finite] @ rotation.T, colors[finite].clip(0.0, 1.0), path[:, 2], (40, 100)
-    )
-    corners = np.array([[left, bottom], [right, top], *path[:, :2]])
-    low, high = corners.min(0), corners.max(0)
-    margin = 0.03 * np.max(high - low)
-    low, high = low - margin, high + margin
-    scale = width / float(np.max(high - low))  # pixels a metre
-
-    def pixels(x: float, y: float) -> tuple[int, int]:
-        return round(float(x - low[0]) * scale), round(float(high[1] - y) * scale)
-
-    corner, end = pixels(left, top), pixels(right, bottom)
-    size = max(end[0] - corner[0], 1), max(end[1] - corner[1], 1)
-    image = Image.fromarray(to_bytes(picture[::-1]), "RGBA")  # up is the first row
-    small = image.resize(size, Image.Resampling.NEAREST)
-    paper = Image.new("RGB", pixels(high[0], low[1]), _PAPER)
-    paper.paste(small, corner, small.getchannel("A"))
-    ImageDraw.Draw(paper).line([pixels(*point) for point in path[:, :2]], fill=OURS, width=2)
-    return paper
 
 
 def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:

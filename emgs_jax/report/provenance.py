@@ -60,7 +60,7 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -
 
 def signature(block: Mapping[str, Any]) -> dict[str, Any]:
     """Return the part of a provenance that determines the bits of a result: no caches, checkpoints or views."""
-    ignored = ("compilation_cache", "checkpoint", "checksums", "view")
+    ignored = ("compilation_cache", "checkpoint", "view")
     return {**block, "config": {key: value for key, value in block["config"].items() if key not in ignored}}
 
 

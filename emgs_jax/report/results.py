@@ -14,7 +14,7 @@ from emgs_jax.io.files import changes, jsonable
 from emgs_jax.report.provenance import RESULT_FORMAT, ROWS, prefix_of
 
 METRICS_FILE = "metrics.json"
-_PLACES = ("dataset.root", "compilation_cache", "checksums")  # say where things are, not what is computed
+_PLACES = ("dataset.root", "compilation_cache")  # say where things are, not what is computed
 
 
 @contextmanager

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import jaxlie
 import numpy as np
+from tqdm import tqdm
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
@@ -17,7 +18,6 @@ from emgs_jax.evaluation.rendering import rendering_metrics, score_view
 from emgs_jax.evaluation.trajectory import align_poses, ate
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.io.bar import Bar
 from emgs_jax.io.files import write_json
 from emgs_jax.io.packages import extra
 from emgs_jax.io.ply import save_gaussians_ply
@@ -77,7 +77,7 @@ def polish(
 
     nearest = _nearest(gaussians)
     seeds, targets, gains = Seeds(run.camera, config.pixels_per_splat), Spool(), []
-    for row in Bar(fitted_rows, desc="splats", unit="frame"):
+    for row in tqdm(fitted_rows, desc="splats", unit="frame"):
         image, view = seen(row)
         seeds.add(view, image, run.poses[row])
         targets.append(target_of(image, view))
@@ -110,7 +110,7 @@ def _fitted(
     anchors: Anchors, colors: np.ndarray, views: Views, run: FinishedRun, config: PolishConfig
 ) -> tuple[Appearance, Views]:
     """`fit` with a progress bar."""
-    with Bar(total=config.steps, desc="polishing", unit="step") as bar:
+    with tqdm(total=config.steps, desc="polishing", unit="step") as bar:
         recent: list[float] = []
 
         def on_step(step: int, psnr: float) -> None:
@@ -205,7 +205,7 @@ def _compare(
     scores: dict[str, list] = {"before": [], "after": []}
     psnr, similarity = {name: [] for name in scores}, {name: [] for name in scores}
     strips = []
-    for row in Bar(held, desc="held-out frames", unit="frame"):
+    for row in tqdm(held, desc="held-out frames", unit="frame"):
         image, view = seen(row)
         after, terms = with_room(partial(_picture, splats, opacity, to_se3(poses[row]), run.camera), terms)
         pictures = {

@@ -8,10 +8,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.evaluation import protocols
 from emgs_jax.evaluation.clouds import NearestPoints, register
-from emgs_jax.evaluation.protocols import NAMES, SegmentationProtocol, ignored_positions, matrix_metrics
-from emgs_jax.evaluation.segmentation import LabelledPoints
+from emgs_jax.evaluation.segmentation import (
+    LabelledPoints,
+    confusion_matrix,
+    segmentation_metrics,
+    transfer_labels,
+)
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.geometry import Sim3
@@ -22,10 +25,12 @@ from emgs_jax.semantics import similarities
 FORMAT, VERSION = "emgs_jax.segmentation", 1
 _TITLES = ("method", "source", "protocol", "scenes", "placed by", "mIoU [%]", "f-mIoU [%]", "Acc [%]")
 _NOTES = """
-Acc is the mean recall of the classes under ovo and conceptgraphs, the share of the points under rayfronts. Quoted rows
-are not measured here: they are of eight scenes of Replica. **simulated**: the prior is disturbed ground truth, which
-says nothing about a network and must not be compared with quoted rows; neither must other scenes or protocols.
+Acc is the mean recall of the classes. Quoted rows are not measured here: they are of eight scenes of Replica.
+**simulated**: the prior is disturbed ground truth, which says nothing about a network and must not be compared with
+quoted rows; neither must other scenes or protocols.
 """
+_KEYS = {"miou": "miou", "fmiou": "fmiou", "acc": "mean_recall"}
+PROTOCOL = "ovo"
 
 
 @dataclass(frozen=True)
@@ -39,13 +44,35 @@ class Placement:
 
 
 @dataclass(frozen=True)
+class Counting:
+    """OVO's protocol: each true point takes the most frequent class of the map's nearest points with a class.
+
+    Args:
+        num_neighbours: of the map, that vote for a true point.
+        ignored: names whose true points do not count.
+    """
+
+    num_neighbours: int
+    ignored: tuple[str, ...]
+
+    def ignored_rows(self, classes: Sequence[str]) -> list[int]:
+        """Return the positions of the ignored names; those that are no classes are skipped."""
+        return [row for row, name in enumerate(classes) if name in self.ignored]
+
+    def metrics(self, confusion: np.ndarray, classes: Sequence[str]) -> dict[str, float | None]:
+        """mIoU, f-mIoU and Acc in percent of one matrix; None without any true point."""
+        found = segmentation_metrics(confusion, self.ignored_rows(classes))
+        return {name: found[f"segmentation/{key}_percent"] for name, key in _KEYS.items()}
+
+
+@dataclass(frozen=True)
 class SceneResult:
     """One map against the truth of its scene."""
 
     scene: str
     folder: str
     is_simulated: bool
-    confusion: np.ndarray  # see `scene_confusion`
+    confusion: np.ndarray  # (c, c + 1), see `segmentation`; one a scene, and they are added
     about: dict[str, Any]
     ate_m: float | None
 
@@ -72,7 +99,7 @@ def score_scene(
     truth: LabelledPoints,
     vectors: np.ndarray,
     how: Placement,
-    protocol: SegmentationProtocol,
+    counting: Counting,
 ) -> SceneResult:
     """Compare the map of a run with the true points of its scene.
 
@@ -83,9 +110,10 @@ def score_scene(
     rows = np.flatnonzero(gaussians.valid)
     cosines = np.asarray(similarities(gaussians, jnp.asarray(vectors, jnp.float32)))[rows]
     has_feature = np.asarray(gaussians.features)[rows].any(1)
-    ignored = ignored_positions(truth.classes, protocol)
-    labels = protocols.give_classes(cosines, has_feature, truth.labels, ignored, protocol)
-    confusion = protocols.scene_confusion(LabelledPoints(points, labels, truth.classes), truth, ignored, protocol)
+    labels = np.where(has_feature, cosines.argmax(1), -1)
+    true = np.where(np.isin(truth.labels, counting.ignored_rows(truth.classes)), -1, truth.labels)
+    found = transfer_labels(points, labels, truth.points, counting.num_neighbours)
+    confusion = confusion_matrix(true, found, len(truth.classes))
     distances = NearestPoints(points).query(truth.points)[0] if len(points) else np.array([np.inf])
     about |= {"num_gaussians": len(rows), "num_with_class": int((labels >= 0).sum())}
     about |= {"num_true_points": len(truth.points), "median_distance_to_map_m": float(np.median(distances))}
@@ -96,10 +124,9 @@ def score_scene(
 
 
 def summary(
-    results: Sequence[SceneResult], classes: Sequence[str], protocol: SegmentationProtocol, how: Placement
+    results: Sequence[SceneResult], classes: Sequence[str], counting: Counting, how: Placement
 ) -> dict[str, Any]:
     """Build the contents of the file: metrics of all scenes and of each, IoU of each class, and the matrices."""
-    ignored = ignored_positions(classes, protocol)
     total = np.sum([result.confusion for result in results], axis=0)
     right, true = np.diagonal(total), total.sum(1)
     union = true + total.sum(0)[: len(classes)] - right
@@ -108,13 +135,13 @@ def summary(
     return {
         "format": FORMAT,
         "version": VERSION,
-        "protocol": asdict(protocol),
+        "protocol": {"name": PROTOCOL} | asdict(counting),
         "placement": asdict(how),
         "simulated": any(result.is_simulated for result in results),
-        "total": protocols.table_metrics([result.confusion for result in results], ignored, protocol) | mean_ate,
+        "total": counting.metrics(total, classes) | mean_ate,
         "scenes": [
             {"scene": result.scene, "map": result.folder, "simulated": result.is_simulated, "ate_sim3_m": result.ate_m}
-            | matrix_metrics(result.confusion, ignored, protocol)
+            | counting.metrics(result.confusion, classes)
             | result.about
             | {"confusion": result.confusion}
             for result in results
@@ -133,14 +160,13 @@ def summary(
 
 
 def table(found: Mapping[str, Any], published: Sequence[Mapping[str, Any]]) -> str:
-    """Write the mean or sum over the scenes, each scene, and quoted rows in Markdown.
+    """Write the sum over the scenes, each scene, and quoted rows in Markdown.
 
     Args:
         published: method, source, protocol, and `values`: mIoU, f-mIoU, Acc and ATE [cm], null where unknown.
     """
     scenes = found["scenes"]
-    over = "one matrix of" if found["protocol"]["scenes"] == "sum" else "mean of"
-    lines = [_line(f"{over} {len(scenes)}", found["total"], found["simulated"], found)]
+    lines = [_line(f"one matrix of {len(scenes)}", found["total"], found["simulated"], found)]
     if len(scenes) > 1:
         lines += [_line(scene["scene"], scene, scene["simulated"], found) for scene in scenes]
     for row in published:
@@ -151,7 +177,7 @@ def table(found: Mapping[str, Any], published: Sequence[Mapping[str, Any]]) -> s
 
 
 def _line(scenes: str, values: Mapping[str, Any], is_simulated: bool, found: Mapping[str, Any]) -> list[str]:
-    cells = [cell(values[name], None, 1.0, 1) for name in NAMES] + [cell(values["ate_sim3_m"], None, 100.0, 1)]
+    cells = [cell(values[name], None, 1.0, 1) for name in _KEYS] + [cell(values["ate_sim3_m"], None, 100.0, 1)]
     source = "**simulated**" if is_simulated else "measured"
     return ["ours", source, found["protocol"]["name"], scenes, found["placement"]["by"], *cells]
 

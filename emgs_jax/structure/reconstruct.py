@@ -9,7 +9,6 @@ import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.io.bar import Bar
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.library import bundle_of, check_kinds, load, member, options_of
 from emgs_jax.structure.pairs import choose_pairs
@@ -107,7 +106,7 @@ def detect(shots: Shots, config: StructureConfig, folder: Path) -> None:
     )
     names = [name for name in shots.names if f"{name}.png" not in done]
     number = {name: index for index, name in enumerate(shots.names)}
-    with Bar(total=len(shots.names), initial=len(shots.names) - len(names), unit="image", desc="features") as bar:
+    with tqdm(total=len(shots.names), initial=len(shots.names) - len(names), unit="image", desc="features") as bar:
         for start in range(0, len(names), BATCH):
             batch = [name for name in names[start : start + BATCH] if _write(shots, number[name], images)]
             if not batch:
@@ -179,7 +178,7 @@ def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
     with pycolmap.Database.open(database) as opened:
         pairs = choose_pairs(opened, [f"{name}.png" for name in shots.names], config)
     pairing = pycolmap.ImportedPairingOptions(match_list_path=str(listed))
-    with Bar(total=len(pairs), unit="pair", desc="matches") as bar:
+    with tqdm(total=len(pairs), unit="pair", desc="matches") as bar:
         for start in range(0, len(pairs), PAIRS):
             some = pairs[start : start + PAIRS]
             listed.write_text("\n".join(f"{a} {b}" for a, b in some), encoding="utf-8")
@@ -224,7 +223,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
             "triangulation": {"random_seed": config.seed},
         }
         options = options_of("IncrementalPipelineOptions", common, refined, given)
-        with Bar(total=len(shots.names), unit="image", desc="structure") as bar:
+        with tqdm(total=len(shots.names), unit="image", desc="structure") as bar:
             found = pycolmap.incremental_mapping(
                 folder / DATABASE, folder / IMAGES, output, options, "", lambda: bar.update(2), bar.update
             )

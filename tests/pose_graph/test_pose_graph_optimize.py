@@ -34,6 +34,7 @@ from rings import (
 )
 from scipy import stats
 
+from emgs_jax.config.schema import schema_of
 from emgs_jax.pose_graph.chordal import chordal_initialization
 from emgs_jax.pose_graph.factors import Nodes, PoseGraph
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, optimize
@@ -409,7 +410,7 @@ def test_loops_that_contradict_the_window_are_refused_or_given_no_weight():
 
 def test_the_solver_of_conf_is_a_config_and_without_iterations_nothing_moves():
     _, graph = noisy_laps(24, 6, 4)
-    default = OmegaConf.load(ROOT / "conf" / "graph" / "default.yaml").solver
+    default = OmegaConf.create(schema_of("graph/schema")).solver
     on, off = (hydra.utils.instantiate(default, **changes) for changes in ({}, {"max_iterations": 0}))
     assert isinstance(on, PoseGraphConfig) and rmse(optimize(graph, on)[0], graph.nodes) > 0.01
     assert same(optimize(graph, off)[0], graph.nodes)

@@ -35,7 +35,7 @@ def wall(depth: float, normal=(0.0, 0.0, -1.0), step: float = 0.15) -> Gaussians
 
 @pytest.fixture(scope="module")
 def densify_config(config):
-    return DensifyConfig(0.05, 0.3, 0.0, config("render.tile_capacity=600").refinement.render, "map")
+    return DensifyConfig(min_std=0.0, render=config("render.tile_capacity=600").refinement.render, points="map")
 
 
 def test_the_points_of_a_slanted_wall_lie_on_it_with_its_normal_and_colour(camera, densify_config):

@@ -17,7 +17,6 @@ from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.ops.camera import Camera
 from emgs_jax.report import live
 from emgs_jax.report.live import LiveConfig, live_view
-from experiments.sweep import sweep
 
 pytestmark = pytest.mark.slow
 
@@ -127,8 +126,6 @@ def test_a_view_that_fails_is_said_and_ends_no_run(capsys):
     assert capsys.readouterr().out.count("the run goes on: RuntimeError('no more memory')") == 1
 
 
-def test_without_a_config_nothing_is_served_and_a_sweep_is_not_watched(tmp_path):
+def test_without_a_config_nothing_is_served():
     with live_view(None, GrowingRun(), None, PRIOR, []) as view:
         assert view is None
-    with pytest.raises(ValueError, match="view= is for run and evaluate"):
-        sweep(compose("view=live", "axes={slam.em.noise:[0.0]}", name="sweep"), tmp_path)

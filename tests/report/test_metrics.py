@@ -7,7 +7,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from hand_run import STATUSES, densify_config, hand_run, poses_along, random_poses, random_similarity, wall
+from hand_run import STATUSES, hand_run, poses_along, random_poses, random_similarity
 from scene import evaluation_config, random_gaussians
 from scipy.spatial.transform import Rotation
 
@@ -18,7 +18,6 @@ from emgs_jax.evaluation.reconstruction import compare_clouds, reference
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.evaluation.trajectory import trajectory_metrics
 from emgs_jax.mapping.records import FrameRecord
-from emgs_jax.report.dense import center_cloud
 from emgs_jax.report.gathering import RawPrior
 from emgs_jax.report.metrics import (
     Scorer,
@@ -26,7 +25,6 @@ from emgs_jax.report.metrics import (
     new_scorer,
     score_map,
     score_prior,
-    score_settings,
     seconds_per_frame,
     spent,
 )
@@ -246,27 +244,3 @@ def test_seconds_a_frame_are_those_of_steps_that_compiled_nothing():
     metrics = spent(SimpleNamespace(phases={"map": 3.0}, compile_seconds=2.0, total_seconds=7.0))
     assert metrics.pop("memory/peak_mb") > 10
     assert metrics == {"time/map_seconds": 3.0, "time/compile_seconds": 2.0, "time/total_seconds": 7.0}
-
-
-@pytest.mark.slow
-def test_settings_that_share_a_data_set_get_the_metrics_that_each_gets_by_itself():
-    """Two walls, of which the second ends half way: what the first frames see is the same, the rest is missing."""
-    true_poses, shifted = poses_along(np.linspace(0.5, 3.5, NUM_FRAMES)), poses_along(np.linspace(0.5, 9.5, NUM_FRAMES))
-    runs = [hand_run(true_poses, shifted, true_poses, gaussians=wall(-1.0, high, 5)) for high in (5.0, 2.0)]
-    truth = center_cloud(runs[0])
-    raw = RawPrior(truth, Spool())
-    scorer = Scorer(
-        Dark(), evaluation_config(), reference(truth, evaluation_config()), None, SimpleNamespace(feature_names=())
-    )
-    config = densify_config()
-    found = score_settings(runs, raw, [config, config], scorer, 2)
-    alone = [score_settings([run], raw, [config], scorer, 1)[0] for run in runs]
-    assert found == alone
-    whole, half = found
-    assert whole["reconstruction/accuracy_m"] < 0.05 and half["reconstruction/accuracy_m"] < 0.05
-    assert half["reconstruction/completion_m"] > 5 * whole["reconstruction/completion_m"]
-    assert whole["raw_prior/reconstruction/accuracy_m"] == half["raw_prior/reconstruction/accuracy_m"]
-    assert not any(key.startswith("time/") for key in whole) and whole["frames/lost"] == 1
-    blind = hand_run(true_poses, shifted, [None] * NUM_FRAMES, gaussians=wall(-1.0, 5.0))
-    (counts,) = score_settings([blind], raw, [config], scorer, 1)
-    assert not any(key.startswith(("trajectory/", "raw_prior/")) for key in counts)

@@ -16,7 +16,6 @@ from emgs_jax.report.overview import (
     draw_overview,
     fill_holes,
     paint_from_above,
-    thumbnail,
     view_from_above,
 )
 
@@ -164,29 +163,3 @@ def test_colours_of_many_classes_differ():
     colors = class_colors(40)
     distance = np.linalg.norm(colors[:, None] - colors[None], axis=-1)
     assert distance[~np.eye(40, dtype=bool)].min() > 0.02 and colors.min() >= 0.0 and colors.max() <= 1.0
-
-
-def test_a_thumbnail_shows_the_map_from_above_with_its_path():
-    """Floor left red and right blue, cameras along the way from left to right; up is -y."""
-    x, z = np.meshgrid(np.linspace(0.0, 4.0, 200), np.linspace(-1.0, 1.0, 100), indexing="ij")
-    points = np.stack([x.ravel(), np.full(x.size, 1.0), z.ravel()], 1)
-    colors = np.where(points[:, :1] < 2.0, [1.0, 0.0, 0.0], [0.0, 0.0, 1.0])
-    colors[z.ravel() > 0.6] = [0.0, 1.0, 0.0]  # far from the first camera, so above in the picture
-    points[0] = np.nan
-    poses = np.tile(np.eye(4), (5, 1, 1))
-    poses[:, 0, 3] = np.linspace(0.5, 3.5, 5)
-    picture = np.asarray(thumbnail(points, colors, poses, width=120)).astype(int)
-    height, width = picture.shape[:2]
-    assert width == 120 and 50 <= height <= 75
-    assert picture[height // 9, width // 2].argmax() == 1 and picture[8 * height // 9, width // 2].argmax() != 1
-    left, right = picture[3 * height // 4, width // 4], picture[3 * height // 4, 3 * width // 4]
-    assert left[0] > 200 > 60 > left[2] and right[2] > 200 > 60 > right[0]
-    on_path = np.abs(picture - [0xE4, 0x57, 0x2E]).max(-1) < 3
-    rows, columns = np.nonzero(on_path)
-    assert abs(rows.mean() - height / 2) < 3 and 10 < columns.min() < 20 and 100 < columns.max() < 110
-    poses[:, 2, 3] = -3.0  # beside the floor: the picture grows, and the path is in it
-    aside = np.asarray(thumbnail(points, colors, poses, width=120)).astype(int)
-    rows, _ = np.nonzero(np.abs(aside - [0xE4, 0x57, 0x2E]).max(-1) < 3)
-    assert aside.shape[0] > height + 30 and rows.min() > 0.9 * aside.shape[0] - 5
-    empty = thumbnail(np.full((3, 3), np.nan), np.zeros((3, 3)), poses, width=20)
-    assert empty.size == (20, 20)

@@ -9,9 +9,11 @@ from hand_run import random_similarity
 from omegaconf import OmegaConf
 
 from emgs_jax.config.configure import compose
+from emgs_jax.evaluation.segmentation import confusion_matrix, transfer_labels
 from emgs_jax.io.map_file import load_map
 from emgs_jax.io.ply import structured, write_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, to_tum
+from emgs_jax.report.segmentation_table import Counting
 from experiments.segment import segment
 from tests.report.written_run import written_run
 
@@ -84,7 +86,7 @@ def test_a_map_in_another_frame_and_scale_is_brought_to_the_truth(run, tmp_path)
 def test_wrong_labels_count_as_the_matrix_says(run, tmp_path):
     """Twenty vertices of the sofa are called wall; one neighbour votes."""
     ids = write_truth(tmp_path / "truth", run, wrong=20)
-    found, _ = scored(run, tmp_path / "truth", protocol={"num_neighbours": 1})
+    found, _ = scored(run, tmp_path / "truth", num_neighbours=1)
     walls, sofas = (ids == 5).sum(), (ids == 9).sum()
     np.testing.assert_array_equal(found["scenes"][0]["confusion"], [[walls - 20, 20, 0], [0, sofas, 0]])
     iou = (walls - 20) / walls, sofas / (sofas + 20)
@@ -117,13 +119,27 @@ def test_two_scenes_are_one_matrix_and_have_a_line_each(run, tmp_path):
     np.testing.assert_allclose(found["total"]["acc"], 100 * np.mean([1 - sofas / (2 * len(ids) - sofas), 1]))
 
 
-@pytest.mark.parametrize("name", ["rayfronts", "conceptgraphs"])
-def test_the_other_protocols_are_named_in_file_and_table(run, tmp_path, name):
-    write_truth(tmp_path / "truth", run)
-    found, said = scored(run, tmp_path / "truth", f"protocol={name}")
-    assert f"| {name} |" in said and (tmp_path / "truth" / "out" / f"segmentation_{name}.json").is_file()
-    # RayFronts ignores walls: what is left is the sofa, which is right.
-    assert found["total"]["miou"] == 100.0 and ("wall" in found["by_class"]) == (name == "conceptgraphs")
+def test_ovo_counts_by_hand():
+    """Vertices: wall → wall twice; chair → chair; chair → table; table → lamp. Unknown: not counted.
+
+    IoU: wall 2/2, chair 1/2, table 0/2, lamp 0/1 (only predicted: counts, with recall 0).
+    """
+    classes = ("wall", "chair", "table", "lamp")
+    given = [[0] * 5, [1, 1, 1, 2, 2], [2, 2, 2, 2, -1], [3, 3, 1, -1, -1], [0, 0, 0, 1, 1]]
+    points = np.array([[place + 1e-3 * offset, 0.0, 0.0] for place in range(5) for offset in (-2, -1, 0, 1, 2)])
+    true = np.array([[0.0, 0, 0], [0.0, 1e-4, 0], [1.0, 0, 0], [2.0, 0, 0], [3.0, 0, 0], [4.0, 0, 0]])
+    labels = transfer_labels(points, np.ravel(given), true, 5)
+    confusion = confusion_matrix(np.array([0, 0, 1, 1, 2, -1]), labels, 4)
+    np.testing.assert_array_equal(confusion, [[2, 0, 0, 0, 0], [0, 1, 1, 0, 0], [0, 0, 0, 1, 0], [0, 0, 0, 0, 0]])
+    found = Counting(5, ()).metrics(confusion, classes)
+    np.testing.assert_allclose([*found.values()], [100 * 1.5 / 4, 100 * (2 + 2 * 0.5) / 5, 100 * 1.5 / 4])
+    np.testing.assert_allclose(Counting(5, ("wall", "door")).metrics(confusion, classes)["miou"], 100 * 0.5 / 3)
+
+
+def test_points_of_an_ignored_class_do_not_count(run, tmp_path):
+    write_truth(tmp_path / "truth", run, wrong=20)
+    found, _ = scored(run, tmp_path / "truth", ignored=["wall", "door"], num_neighbours=1)
+    assert found["scenes"][0]["confusion"][0].sum() == 0 and found["total"]["acc"] == 100.0
 
 
 def test_what_is_missing_or_does_not_fit_is_named(run, tmp_path):

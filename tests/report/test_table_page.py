@@ -1,4 +1,4 @@
-"""Pages of evaluations and sweeps as text, and in Chromium; oracles: an HTML parser, runs made by hand, known sizes."""
+"""Pages of evaluations as text, and in Chromium; oracles: an HTML parser, runs made by hand, known sizes."""
 
 import base64
 import io
@@ -12,18 +12,14 @@ import numpy as np
 import pytest
 from page_elements import HOSTILE, Elements
 from PIL import Image
-from tiny_run import compose
 from written_run import written_run
 
 from emgs_jax.io.files import write_json
 from emgs_jax.report import html
 from emgs_jax.report.evaluation_page import Found, JobLine, verdict, write_evaluation_page
-from emgs_jax.report.html import MAX_BYTES, thumbnails
+from emgs_jax.report.html import thumbnails
 from emgs_jax.report.results import estimates_of
-from emgs_jax.report.sweep_page import write_sweep_page
-from emgs_jax.report.sweeps import picture_path
 from emgs_jax.report.tables import average
-from experiments.together import shared_settings
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
 
@@ -149,54 +145,3 @@ def test_pictures_are_as_large_as_all_of_them_fit(tmp_path, monkeypatch):
     assert widths[10**7] == [360, 360] and widths[40_000][0] < 360 and len(widths[10_000]) == 2
     monkeypatch.setattr(html, "PICTURE_BYTES", int(1.5 * len(found[0])))
     assert [bool(text) for text in thumbnails(paths)] == [True, False, False, False]  # the first that fit
-
-
-BLOCK = {
-    "protocol": "paper/sim3",
-    "simulated": True,
-    "prior": {"name": "simulated"},
-    "data": {"name": "synthetic", "sequence": "room0"},
-    "device": {"kind": "cpu"},
-    "git": {"revision": "0123456789abcdef", "dirty": True},
-}
-AXES = ("slam.em.noise", "slam.em.max_log_gap")
-
-
-def swept(folder: Path, settings: dict, **more) -> Path:
-    rows = [dict(zip(AXES, values, strict=True)) | metrics for values, metrics in settings.items()]
-    block = json.loads(json.dumps(BLOCK | {"config": shared_settings(compose("dataset.seed=7", name="sweep"))} | more))
-    return write_sweep_page(folder, block, rows, AXES, "emgs sweep sweep=gates")
-
-
-def test_a_sweep_shows_every_setting_with_its_map_and_how_the_best_becomes_a_run(tmp_path):
-    raw = {f"raw_prior/{ATE}": 0.03}
-    settings = {(0.5, 8.0): {ATE: 0.02} | raw, (0.5, "inf"): {ATE: 0.01} | raw, (1.0, 8.0): raw}
-    picture_at(picture_path(tmp_path, dict(zip(AXES, (0.5, "inf"), strict=True))), (200, 100))
-    picture_at(tmp_path / "heat_map.png")
-    path = swept(tmp_path, settings)
-    text = " ".join(words_of(path).split())
-    assert "3 settings; best ATE [cm]: 1.00 with slam.em.noise=0.5, slam.em.max_log_gap=inf." in text
-    assert "raw prior 3.00" in text and "0.5 8.0 2.00" in text and "1.0 8.0 –" in text
-    assert "SIMULATED" in text and "emgs sweep sweep=gates" in text and "0123456789ab with changes" in text
-    command = re.search(r"emgs run .*?slam\.em\.max_log_gap=inf", text)[0]
-    assert "dataset.seed=7" in command and "slam.em.noise=0.5" in command
-    images = [attributes["src"] for tag, attributes in Elements(path.read_text()).found if tag == "img"]
-    sizes = [Image.open(io.BytesIO(base64.b64decode(source.partition(",")[2]))).size for source in images]
-    assert sizes == [(800, 500), (200, 100)]
-    assert path.read_text().count('class="best"') == 1
-
-
-def test_a_sweep_without_truth_shows_its_frames(tmp_path):
-    path = swept(tmp_path, {(0.5, 8.0): {"frames/tracked": 5, "frames/lost": 2, "frames/degraded": 0}}, git=None)
-    text = " ".join(words_of(path).split())
-    assert "no ground truth, 5 tracked, 2 lost" in text and "no checkout" in text and "raw prior" not in text
-
-
-def test_a_large_sweep_stays_below_the_size_of_a_page_and_says_what_is_left_out(tmp_path):
-    settings = {(number / 7, 8.0): {ATE: 0.01 * number, F1: 1.0 * number} for number in range(700)}
-    paths = [picture_path(tmp_path, dict(zip(AXES, values, strict=True))) for values in settings]
-    picture_at(paths[0], (240, 180), 255)
-    for path in paths[1:]:
-        path.write_bytes(paths[0].read_bytes())
-    path = swept(tmp_path, settings)
-    assert path.stat().st_size < MAX_BYTES and "sweep.csv has 200 more settings" in path.read_text()

@@ -133,7 +133,7 @@ def test_the_help_of_a_run_lists_exactly_the_choices_that_there_are(monkeypatch,
     own["baseline"].remove("smoke")  # a file of the gate, which is no option
     for shared in ("checked", "matched", "monocular"):  # what ways to depth have in common
         own["prior/dense"].remove(shared)
-    of_other_commands = {"densify_on", "experiment_on", "protocol", "suite", "sweep", "tune"}
+    of_other_commands = {"densify_on", "experiment_on", "protocol", "suite"}
     stages = {name for name in own if name.startswith("slam/")}
     assert listed == {name: own[name] for name in {*own} - of_other_commands - stages | {"slam/em"}}
     assert {*re.findall(r"slam/\w+", lines["slam/em"]), "slam/em"} == stages
@@ -206,7 +206,7 @@ for words in ([], ["--version"], *([name, "--help"] for name in COMMANDS)):
     sys.argv = ["emgs", *words]
     with contextlib.redirect_stdout(io.StringIO()) as said, contextlib.suppress(SystemExit):
         main()
-    heavy = {"jax", "open3d", "torch", "matplotlib", "scipy", "trimesh", "equinox", "optuna", "viser"} & {*sys.modules}
+    heavy = {"jax", "open3d", "torch", "matplotlib", "scipy", "trimesh", "equinox", "viser"} & {*sys.modules}
     print(*words, len(said.getvalue()), sorted(heavy), file=sys.stderr)
 """
 
@@ -427,8 +427,8 @@ def begun(program: str):
 
 
 def test_a_signal_while_a_command_imports_ends_it_with_a_word():
-    """Found by the kills: `python -m experiments.tune` showed where in a library's import it was."""
-    command = [sys.executable, "-X", "importtime", "-m", "experiments.tune"]
+    """Found by the kills: `python -m experiments.run` showed where in a library's import it was."""
+    command = [sys.executable, "-X", "importtime", "-m", "experiments.run"]
     with heard():
         process = subprocess.Popen(command, cwd=CONF.parent, stderr=subprocess.PIPE, text=True)
     with process:
@@ -452,9 +452,8 @@ def test_a_signal_that_is_ignored_stays_so():
         signal.signal(signal.SIGINT, before)
 
 
-@pytest.mark.parametrize("name", ["config", "sweep", "tune"])
-def test_the_folder_of_several_runs_is_known_before_the_first(name):
+def test_the_folder_of_several_runs_is_known_before_the_first():
     """`emgs run -m prior.seed=0,1` ended with "HydraConfig was not set": Hydra asks for it before there is a job."""
     with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF.resolve())):
-        config = hydra.compose(name, return_hydra_config=True)
-    assert re.fullmatch(rf"multirun/({name}/)?synthetic/[\d_-]+", config.hydra.sweep.dir)
+        config = hydra.compose("config", return_hydra_config=True)
+    assert re.fullmatch(r"multirun/synthetic/[\d_-]+", config.hydra.sweep.dir)

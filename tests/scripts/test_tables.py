@@ -4,17 +4,16 @@ import json
 import re
 from pathlib import Path
 
-import hydra
 import pytest
 from omegaconf import OmegaConf
 from tiny_run import CONF
 
 import experiments.evaluate
-import experiments.tables
+import tools.tables
 from emgs_jax.io.files import write_json
 from emgs_jax.report.provenance import RAW_PRIOR, RESULT_FORMAT, prefixed
 from emgs_jax.report.results import METRICS_FILE
-from experiments.tables import COLUMNS, SHORT, block, evaluations, short_block, tables, with_blocks
+from tools.tables import COLUMNS, CONFIG, SHORT, block, evaluations, short_block, tables, with_blocks
 
 PAGE = "before\n<!-- table: some -->\nold\n<!-- end -->\nbetween\n<!-- table: other -->\n<!-- end -->\nafter\n"
 ONE_COMMIT = {"revision": "0123456789abcdef", "dirty": False}
@@ -100,17 +99,15 @@ def test_only_what_stands_between_the_markers_changes_and_a_second_time_nothing_
 
 @pytest.fixture
 def settings(tmp_path):
-    """conf/tables.yaml with the built-in room alone."""
-    with hydra.initialize_config_dir(version_base="1.3", config_dir=str(CONF)):
-        pages = [f"page={tmp_path / 'page.md'}", f"full_page={tmp_path / 'full.md'}"]
-        config = hydra.compose("tables", ["root=nowhere", f"out={tmp_path / 'out'}", *pages])
-        config = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-        settings = {"default": {}, "level 2": {"prior.level": 2}}
-        config["short"]["data"] = ["synthetic"]
-        config["tables"] = {"some": [{"data": ["synthetic"], "seeds": [3, 4], "settings": settings}]}
-        for name in ("page.md", "full.md"):
-            (tmp_path / name).write_text(PAGE)
-        yield config
+    """tools/tables.yaml with the built-in room alone."""
+    pages = {"page": tmp_path / "page.md", "full_page": tmp_path / "full.md"}
+    for page in pages.values():
+        page.write_text(PAGE)
+    config = OmegaConf.to_container(OmegaConf.load(CONFIG), resolve=False)
+    config["short"]["data"] = ["synthetic"]
+    settings = {"default": {}, "level 2": {"prior.level": 2}}
+    own = {"root": "nowhere", "out": str(tmp_path / "out")} | {key: str(page) for key, page in pages.items()}
+    return config | own | {"tables": {"some": [{"data": ["synthetic"], "seeds": [3, 4], "settings": settings}]}}
 
 
 @pytest.mark.slow
@@ -127,11 +124,11 @@ def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_t
         write_json(path, metrics)
 
     monkeypatch.setattr(experiments.evaluate, "run", run)
-    monkeypatch.setattr(experiments.tables, "git_now", lambda: ONE_COMMIT | {"dirty": True})
+    monkeypatch.setattr(tools.tables, "git_now", lambda: ONE_COMMIT | {"dirty": True})
     with pytest.raises(ValueError, match="of one commit without changes"):
         tables(settings)
     assert not runs
-    monkeypatch.setattr(experiments.tables, "git_now", lambda: ONE_COMMIT)
+    monkeypatch.setattr(tools.tables, "git_now", lambda: ONE_COMMIT)
     with pytest.raises(ValueError, match="the disk is full"):
         tables(settings)
     assert page.read_text() == PAGE
@@ -141,7 +138,7 @@ def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_t
     assert "Runs of 2" in full and "(default):" in full and "(level 2):" in full and "old" not in full
     assert "| room | ours |" in text and "level 2" not in text and "Runs of" not in text and "old" not in text
     # What is there can be written again by other code, which did not make it.
-    monkeypatch.setattr(experiments.tables, "git_now", lambda: None)
+    monkeypatch.setattr(tools.tables, "git_now", lambda: None)
     tables(settings)
     assert len(runs) == 5 and (page.read_text(), Path(settings["full_page"]).read_text()) == (text, full)
 
@@ -149,7 +146,7 @@ def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_t
 @pytest.mark.parametrize("page", ["page", "full_page"])
 def test_a_page_that_cannot_be_written_is_named_before_the_runs(settings, page, monkeypatch):
     """Elsewhere than in the clone there is no README.md, which was told after all evaluations."""
-    monkeypatch.setattr(experiments.tables, "evaluate", None)
+    monkeypatch.setattr(tools.tables, "evaluate", None)
     Path(settings[page]).unlink()
     with pytest.raises(ValueError, match=f"{settings[page]} is no file: give page=FILE and full_page=FILE"):
         tables(settings)
@@ -167,7 +164,7 @@ def test_the_data_of_the_tables_may_lie_anywhere(settings):
 
 
 def test_both_pages_have_the_places_of_all_tables_every_row_has_a_title_and_both_are_of_one_commit():
-    config, about = OmegaConf.load(CONF / "tables.yaml"), []
+    config, about = OmegaConf.load(CONFIG), []
     for key in ("page", "full_page"):
         text = (CONF.parent / config[key]).read_text()
         assert all(text.count(f"<!-- table: {name} -->") == 1 for name in config.tables)

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 from jaxtyping import Float
@@ -9,6 +10,7 @@ from tqdm import tqdm
 
 from emgs_jax.ops.ranges import number, one_of
 from emgs_jax.prior.multiview.dense import DenseConfig, Depth, Depths, Scene, tried_depths
+from emgs_jax.prior.multiview.depth_noise import DepthNoiseConfig
 from emgs_jax.prior.multiview.landmark_fit import KINDS, LandmarkFit, LandmarkFitConfig, fit_to_landmarks, to_depth
 from emgs_jax.prior.multiview.landmarks import landmarks_of, point_information
 from emgs_jax.structure.model import Structure, scaled
@@ -26,6 +28,10 @@ class MonocularConfig(DenseConfig):
         pixel_std: of a landmark, in pixels of the images that the structure was made of.
     """
 
+    # Nothing is matched; the spread is that of the landmark fit.
+    noise: DepthNoiseConfig = field(
+        default_factory=partial(DepthNoiseConfig, pixel_std=0.0, spread_std=1.0, difference_std=1.0, max_std=0.2)
+    )
     fit: LandmarkFitConfig = field(default_factory=LandmarkFitConfig)
     kind: str = one_of(*KINDS)
     depth_margin: float = number(2.0, low=1, high=1000)

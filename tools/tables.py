@@ -1,54 +1,44 @@
-"""Write the tables of README.md and docs/measurements/results.md: `python -m experiments.tables root=FOLDER`.
+"""Write the tables of README.md and docs/measurements/results.md: `python -m tools.tables root=FOLDER [KEY=VALUE …]`.
 
-The rows are the evaluations of conf/tables.yaml; what is finished is not run again. Nothing is written unless all of
-them are finished and of the same commit. The line above a table says where it comes from. The first page has the rows
-and columns that most people look for, with the best of each data set in bold; the second has all, and counts the runs
-in which the map is better than each other estimate.
+The rows are the evaluations of tools/tables.yaml, whose keys can be given; what is finished is not run again. Nothing
+is written unless all are finished and of one commit. The first page has the rows and columns that most people look for;
+the second has all, and counts the runs in which the map is better.
 """
 
 import re
-import shlex
+import sys
 import textwrap
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import hydra
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import OmegaConf
 
+from emgs_jax.config.configure import compose
 from emgs_jax.config.overrides import quoted
+from emgs_jax.device.settings import use_compilation_cache
 from emgs_jax.io.files import check_writable, write_file
 from emgs_jax.report.columns import Column, Line, markdown, metric_table
 from emgs_jax.report.provenance import git_now
 from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
 from emgs_jax.report.tables import COLUMNS as ALL
 from emgs_jax.report.tables import average
+from experiments.evaluate import evaluate, plan
 
-from .command import command
-from .evaluate import evaluate, plan
-
-Settings = Mapping[str, Any]  # a resolved conf/evaluate.yaml
+CONFIG = Path(__file__).with_suffix(".yaml")
 COLUMNS = tuple(column._replace(digits=1) for column in ALL if not column.key.startswith(("time/", "trajectory/scale")))
-_SHORT = {  # of the first page: lengths and shares by the points
-    "trajectory/ate_sim3_m": "ATE [cm]",
-    "reconstruction_icp/accuracy_m": "accuracy [cm]",
-    "reconstruction_icp/completion_m": "completion [cm]",
-    "reconstruction_icp/f1_5cm_percent": "F1@.05 [%]",
-    "reconstruction_icp/normals_abs_cos_percent": "normals [%]",
-    "rendering/depth_within_5_percent": "depth within 5 % [%]",
-}
+_SHORT = OmegaConf.load(CONFIG).short.columns
 SHORT = tuple(column._replace(title=_SHORT[column.key]) for column in COLUMNS if column.key in _SHORT)
 
 
-def evaluations(config: Mapping[str, Any], table: str) -> Iterator[Settings]:
-    """The settings of the evaluations of one table; `config` is a resolved conf/tables.yaml."""
+def evaluations(config: Mapping[str, Any], table: str) -> Iterator[Mapping[str, Any]]:
+    """The settings of the evaluations of one table; `config` is a resolved tables.yaml."""
     for entry in config["tables"][table]:
-        composed = hydra.compose("evaluate", [f"suite.root={quoted(config['root'])}", "suite=slices"])
+        composed = compose(f"suite.root={quoted(config['root'])}", "suite=slices", name="evaluate")
         settings = OmegaConf.to_container(composed, resolve=True)
         data = {name: settings["suite"]["data"][name] for name in entry["data"]}
-        out = str(Path(config["out"]) / table)
-        changes = {"suite": {"data": data}, "seeds": entry["seeds"], "variants": entry["settings"], "out": out}
-        yield settings | changes | {"compilation_cache": config["compilation_cache"]}
+        own = {"seeds": entry["seeds"], "variants": entry["settings"], "out": str(Path(config["out"]) / table)}
+        yield settings | {"suite": {"data": data}} | own
 
 
 def revision_of(blocks: Iterable[Mapping[str, Any] | None]) -> str:
@@ -56,9 +46,7 @@ def revision_of(blocks: Iterable[Mapping[str, Any] | None]) -> str:
     found = {None if block is None or block["dirty"] is not False else block["revision"] for block in blocks}
     revision = found.pop() if found else None
     if found or revision is None:
-        raise ValueError(
-            "the tables are of one commit without changes: commit, move results of other code away, and run again"
-        )
+        raise ValueError("tables are of one commit without changes: commit, move other results away, and run again")
     return revision[:12]
 
 
@@ -75,36 +63,34 @@ def block(paths: Sequence[Path], titles: Mapping[str, str]) -> str:
 def short_block(paths: Sequence[Path], titles: Mapping[str, str], short: Mapping[str, Sequence[str]]) -> str:
     """Likewise with the columns of `SHORT`, and of the rows those of the `data`, `settings` and `kinds` of `short`."""
     estimates = [item for path in paths for item in estimates_of(path)]
-    shown = [
-        item
-        for item in estimates
-        if item.dataset in short["data"] and item.variant in short["settings"] and item.kind in short["kinds"]
-    ]
+    places = {"dataset": "data", "variant": "settings", "kind": "kinds"}
+    shown = [item for item in estimates if all(getattr(item, name) in short[key] for name, key in places.items())]
     return f"\n{_about(paths)}\n\n{_table(shown, titles, SHORT, is_best_bold=True)}\n"
 
 
 def _about(paths: Sequence[Path]) -> str:
     """Prior, data, seeds, protocol, device and commit, in words."""
+
+    def distinct(values: Iterable[Any]) -> str:
+        return ", ".join(map(str, dict.fromkeys(values)))
+
     blocks = [read_metrics(path) for path in paths]
     origins = [block["provenance"] for block in blocks]
-    frames: dict[str, int] = {}
-    for found, origin in zip(blocks, origins, strict=True):
-        frames[f"{origin['data']['name']} {origin['data']['sequence']}"] = found["trajectory/num_frames"]
-    data = ", ".join(f"{name} ({count} frames)" for name, count in frames.items())
+    frames = {
+        f"{origin['data']['name']} {origin['data']['sequence']}": found["trajectory/num_frames"]
+        for found, origin in zip(blocks, origins, strict=True)
+    }
     label = " (**simulated**)" if any(origin["simulated"] for origin in origins) else ""
+    devices = [origin["device"] for origin in origins]
     facts = {
-        "Prior": _distinct(origin["prior"]["name"] for origin in origins) + label,
-        "data": data,
-        "`prior.seed`": _distinct(origin["seed"] for origin in origins),
-        "protocol": _distinct(origin["protocol"] for origin in origins),
-        "device": _distinct(f"{one['kind']}, {one['cpu_count']} CPU cores" for one in (o["device"] for o in origins)),
+        "Prior": distinct(origin["prior"]["name"] for origin in origins) + label,
+        "data": ", ".join(f"{name} ({count} frames)" for name, count in frames.items()),
+        "`prior.seed`": distinct(origin["seed"] for origin in origins),
+        "protocol": distinct(origin["protocol"] for origin in origins),
+        "device": distinct(f"{device['kind']}, {device['cpu_count']} CPU cores" for device in devices),
         "commit": f"`{revision_of(origin['git'] for origin in origins)}`",
     }
     return textwrap.fill("; ".join(f"{name} {value}" for name, value in facts.items()) + ".", 130)
-
-
-def _distinct(values: Iterable[Any]) -> str:
-    return ", ".join(map(str, dict.fromkeys(values)))
 
 
 def _table(
@@ -156,22 +142,18 @@ def with_blocks(page: Path, blocks: Mapping[str, str]) -> str:
 
 
 def tables(config: Mapping[str, Any]) -> None:
-    """Run what is not finished and write all tables of both pages; `config` is a resolved conf/tables.yaml."""
+    """Run what is not finished and write all tables of both pages; `config` is a resolved tables.yaml."""
     pages = Path(config["page"]), Path(config["full_page"])
     for page in pages:  # before the runs
         check_writable(page.parent, str(page))
         with_blocks(page, dict.fromkeys(config["tables"], ""))
-    planned = {table: list(evaluations(config, table)) for table in config["tables"]}
-    paths = {
-        name: [job.folder / METRICS_FILE for settings in table for job in plan(settings)]
-        for name, table in planned.items()
-    }
+    planned = {name: list(evaluations(config, name)) for name in config["tables"]}
+    paths = {name: [job.folder / METRICS_FILE for one in some for job in plan(one)] for name, some in planned.items()}
     everything = [path for found in paths.values() for path in found]
     finished = [path for path in everything if path.is_file()]
     if len(finished) < len(everything):  # in half an hour it would be too late to learn that the code has changes
         revision_of([git_now(), *_code_of(finished)])
-    again = shlex.join(["emgs", "tables", f"root={config['root']}"])
-    problems = [line for table in planned.values() for settings in table for line in evaluate(settings, again)]
+    problems = [line for table in planned.values() for settings in table for line in evaluate(settings)]
     if problems:
         raise ValueError("\n       ".join([f"problems: {len(problems)}", *problems]))
     revision_of(_code_of(everything))
@@ -181,9 +163,9 @@ def tables(config: Mapping[str, Any]) -> None:
         write_file(page, with_blocks(page, blocks))
 
 
-@command("tables")
-def main(config: DictConfig) -> None:
-    """Write the tables."""
+def main() -> None:
+    config = OmegaConf.merge(OmegaConf.load(CONFIG), OmegaConf.from_cli(sys.argv[1:]))
+    use_compilation_cache()
     tables(OmegaConf.to_container(config, resolve=True, throw_on_missing=True))
     print(f"the tables of {config.page} and {config.full_page} are written")
 
