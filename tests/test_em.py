@@ -323,6 +323,7 @@ def error_of(claim, config, seed: int) -> float:
     return np.sqrt(np.mean(np.where(total > 0, means[:, 2] - 2.0, 0.0) ** 2))
 
 
+@pytest.mark.slow
 def test_confidence_makes_a_map_better_and_a_wrong_one_not_worse(config):
     """Another law than the simulator's: two levels. Claims are (of the good half, of the bad half)."""
     chosen = config().em
@@ -372,6 +373,7 @@ def test_a_point_with_a_number_that_is_none_is_left_out(paper, what):
     sc.assert_same(em(MAP, points, noise, config), expected)
 
 
+@pytest.mark.slow
 def test_where_a_gaussian_has_a_vanishing_share_its_support_has_finite_slopes(paper):
     """1e-21 over 1e-21: the slopes of the ratio overflow."""
     gaussians, points = sc.join(sc.rows_of(GAUSSIANS, [0, 0])), sc.join(sc.rows_of(POINTS, [0, 1]))
