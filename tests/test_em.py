@@ -219,6 +219,15 @@ def test_support_has_its_literal_values(opened, weights, printed, normalized):
     assert support_of(CORNERS, weights, opened, "normalized") == pytest.approx(normalized, abs=1e-6)
 
 
+def test_what_nothing_explains_adds_its_feature_to_nothing(opened):
+    is_far = np.arange(M) % 2 == 0
+    points = sc.replace(POINTS, points=np.asarray(POINTS.points) + 100.0 * is_far[:, None])
+    updated, is_fused, _ = em(MAP, points, QUIET, sc.changed(opened, feature=1.0, max_mahalanobis_sq=60.0))
+    assert is_fused[~is_far].sum() > 10 and not is_fused[is_far].any()
+    added = np.asarray(updated.gaussians.features) - np.asarray(GAUSSIANS.features)
+    np.testing.assert_allclose(added.sum(axis=0), np.asarray(POINTS.features)[is_fused].sum(axis=0), rtol=1e-4)
+
+
 def test_points_along_the_normal_do_not_count_as_sides(opened):
     above_and_below = [(1, 1, 5), (1, 1, -5)]
     assert support_of(above_and_below, [1.0, 1.0], opened, "normalized") == 0
@@ -314,6 +323,7 @@ def error_of(claim, config, seed: int) -> float:
     return np.sqrt(np.mean(np.where(total > 0, means[:, 2] - 2.0, 0.0) ** 2))
 
 
+@pytest.mark.slow
 def test_confidence_makes_a_map_better_and_a_wrong_one_not_worse(config):
     """Another law than the simulator's: two levels. Claims are (of the good half, of the bad half)."""
     chosen = config().em
@@ -363,6 +373,7 @@ def test_a_point_with_a_number_that_is_none_is_left_out(paper, what):
     sc.assert_same(em(MAP, points, noise, config), expected)
 
 
+@pytest.mark.slow
 def test_where_a_gaussian_has_a_vanishing_share_its_support_has_finite_slopes(paper):
     """1e-21 over 1e-21: the slopes of the ratio overflow."""
     gaussians, points = sc.join(sc.rows_of(GAUSSIANS, [0, 0])), sc.join(sc.rows_of(POINTS, [0, 1]))

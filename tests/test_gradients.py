@@ -136,7 +136,9 @@ ICP = pytest.mark.xfail(
 )
 
 
-@pytest.mark.parametrize("name", ["em", pytest.param("icp", marks=ICP), "extrapolation", "render"])
+@pytest.mark.parametrize(
+    "name", ["em", pytest.param("icp", marks=[ICP, pytest.mark.weekly]), "extrapolation", "render"]
+)
 def test_a_derivative_by_one_kind_of_input_is_that_of_float64_differences(name):
     """The solver has a loop, which has forward mode only, and the renderer a reverse mode of its own."""
     function, given, inputs = case(name)

@@ -90,6 +90,7 @@ def test_the_map_moves_with_the_anchor(result, views, camera, config):
     np.testing.assert_allclose(weight.sum(), result[1].sum(), rtol=1e-5)
 
 
+@pytest.mark.slow
 def test_features_of_width_zero_are_possible(camera, config, result):
     views = sc.stack([sc.observe_room(T, camera) for T in POSES])
     gaussians, _, _ = first_map(views, sc.stack_poses(POSES), camera, 1, config().fit)

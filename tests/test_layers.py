@@ -106,6 +106,7 @@ def test_what_is_no_second_layer_stays(config, parts, change, words):
     assert np.asarray(one.gaussians.valid).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("count", [1, 2])
 def test_maps_of_fewer_gaussians_than_a_mean_is_over_become_one_too(config, count):
     map, is_other = walls(FIRST[:count], FIRST[:count] + [0, 0, GAP])

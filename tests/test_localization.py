@@ -258,6 +258,15 @@ def test_pairs_that_are_farther_apart_than_allowed_are_none(wide, printed):
     assert sc.pose_error(near.T_world_camera, moved)[0] > 1e-3
 
 
+def test_a_pose_of_which_a_part_is_no_number_is_none(wide, printed):
+    given = sc.predict_room(FRAME, wide)
+    views = np.array(given.T_world_views.wxyz_xyz)
+    views[1, 4:] = np.nan
+    given = eqx.tree_at(lambda p: p.T_world_views, given, jaxlie.SE3(sc.device(views)))
+    found = coarse_of(given, wide, sc.at(printed, "coarse", COARSE["anchored"]))
+    assert not found.is_usable and max(sc.pose_error(found.T_world_camera, sc.path_pose(FRAME - 1))) < 1e-6
+
+
 def test_where_nothing_leads_from_the_frame_before_a_pose_is_as_uncertain_as_a_fine_step_may_go(wide, printed):
     given = sc.predict_room(FRAME, wide)
     before = sc.moved_points(sc.path_pose(FRAME - 1), given.previous)

@@ -36,7 +36,7 @@ def test_the_type_marker_and_every_yaml_are_installed():
 
 def test_the_sources_of_the_report_are_installed_and_are_readable_text():
     """No bundle of others: short files, short lines."""
-    assert SETUP["package-data"]["emgs_jax.report"] == ["web/*"]
+    assert SETUP["package-data"]["emgs_jax.report"] == ["web/*", "published.yaml"]
     sources = sorted((ROOT / "emgs_jax" / "report" / "web").iterdir())
     assert {path.suffix for path in sources} == {".html", ".css", ".js", ".vert", ".frag"}
     for path in sources:

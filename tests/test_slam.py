@@ -164,6 +164,7 @@ def test_both_halves_of_what_is_split_are_in_the_map(state, settings):
     assert info.num_gaussians - held - info.refinement.num_fresh > 0.3 * held
 
 
+@pytest.mark.slow
 def test_what_moves_is_as_if_it_had_no_points_but_hides_what_is_seen_through_and_is_the_next_frames(window, camera):
     """A slab at half the depth after four frames without it, in a prediction whose lengths are half the map's."""
     config = lenient("slam/motion=default", "slam.motion.num_looks=3")
@@ -497,6 +498,7 @@ def off_walls(points):
     return np.minimum(np.abs(points - reference.ROOM_LOW), np.abs(points - reference.ROOM_HIGH)).min(axis=-1)
 
 
+@pytest.mark.slow
 def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera):
     """Oracle: the room's walls, and the camera's path. The prior's points lie where its own poses put them."""
     chosen = sc.changed(sc.slam_config(*WHOLE, "slam.em.average.gain=count"), **LENIENT)

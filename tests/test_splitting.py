@@ -191,6 +191,7 @@ def frames_of_a_checkerboard(config, splitting, num_frames=12):
     return counts, float(np.mean(np.abs(shown - points.colors)[step.is_fused]))
 
 
+@pytest.mark.slow
 def test_a_checkerboard_seen_near_becomes_its_squares_and_then_no_more(config):
     whole, settings = config("slam.em.num_neighbours=8"), config().splitting
     _, blurred = frames_of_a_checkerboard(whole, at(settings, "min_points", 1e6))  # never near enough

@@ -33,8 +33,6 @@ SMOKE = (  # for what needs images in which places are recognised; as few points
     *("slam.em.num_neighbours=6", "slam.fit.num_fit_neighbours=8"),
 )
 
-SMALL_STEREO = ("prior=multiview_stereo", "prior.dense.depth.sweep.num_planes=40", "prior.structure.num_threads=1")
-
 
 def compose(*overrides: str, name: str = "config"):
     """conf/ as Hydra composes it for a script, with the small setting; a copy of one's own."""

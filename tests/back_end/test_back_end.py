@@ -527,6 +527,7 @@ def test_a_gaussian_is_seen_from_the_node_of_its_birth(graph):
     np.testing.assert_array_equal(after.map.gaussians.valid, [True, False, True, True])
 
 
+@pytest.mark.slow
 def test_one_layer_has_the_rows_of_what_the_first_nodes_have_made(graph):
     """Whichever of the two is nearer to the camera."""
     end, state = sheets(graph, [0, 1, 1, 0])

@@ -45,6 +45,7 @@ GATES = ("slam.em.max_mahalanobis_sq=1", "slam.refinement.max_mahalanobis_sq_2d=
 WEEKLY = pytest.mark.weekly
 OVERRIDES = ("prior.level=1", "checkpoint.every=2", "slam.submap.map_capacity=512", *GATES)
 GRAPH = ("graph=default", "graph.every=1")
+LARGE = ("slam.submap.map_capacity=1024",)  # at once, as tiny_run has it
 MOVING = ("slam/motion=default", "slam.motion.num_looks=2", "slam.motion.prior=1", "dataset.movers=1")
 SHOWS_TIMES = {"metrics.json", "frames.jsonl", "overview.png", "report.html"}
 
@@ -133,7 +134,8 @@ def goes_on(folder: Path, more: tuple[str, ...], num_steps: range, monkeypatch) 
 @pytest.mark.parametrize(
     ("stop", "more", "num_steps"),
     [
-        (partial(in_step, 3, True), (), range(1, NUM_FRAMES - 1)),
+        (partial(in_step, 3, True), LARGE, range(1, NUM_FRAMES - 1)),
+        pytest.param(partial(in_step, 3, True), (), range(1, NUM_FRAMES - 1), marks=pytest.mark.slow),
         pytest.param(partial(in_step, 1, False), (), range(1, NUM_FRAMES - 1), marks=WEEKLY),
         pytest.param(partial(in_step, 3, False), GRAPH, range(1, NUM_FRAMES - 1), marks=WEEKLY),
         pytest.param(partial(in_step, 3, True), ("baseline=voxel",), range(1, NUM_FRAMES - 1), marks=WEEKLY),

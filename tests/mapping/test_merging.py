@@ -59,6 +59,7 @@ def metrics_of(folder: Path) -> dict:
     return json.loads((folder / "metrics.json").read_text())
 
 
+@pytest.mark.weekly  # two whole runs and a third of both: three minutes
 def test_two_laps_of_two_cameras_in_two_units_become_one_map_that_is_better_than_each(runs):
     first, second, both = (metrics_of(runs / name) for name in ("first", "second", "both"))
     assert both["trajectory/num_frames"] == both["frames/tracked"] + 2 == 40 and both["submaps/unjoined_frames"] == 0
@@ -73,6 +74,7 @@ def test_two_laps_of_two_cameras_in_two_units_become_one_map_that_is_better_than
     assert both["map/num_gaussians"] < 0.8 * sum(one["map/num_gaussians"] for one in (first, second)), "both saw it"
 
 
+@pytest.mark.weekly
 def test_a_merged_run_is_a_run_like_any_other_in_the_world_of_the_first(runs):
     first, both = (read_run(runs / name) for name in ("first", "both"))
     distance, _ = pose_difference(both.poses[:20], first.poses)
@@ -88,6 +90,7 @@ def test_a_merged_run_is_a_run_like_any_other_in_the_world_of_the_first(runs):
     assert saved.back_end.first_node == 40 and saved.count >= metrics_of(runs / "both")["map/num_gaussians"]
 
 
+@pytest.mark.weekly
 def test_what_the_records_say_of_other_poses_and_frames_is_in_the_world_and_the_numbers_of_the_merged_run(runs):
     """Symptom: the raw path and the origins of the second run were in its own world, unit and numbers."""
     second, both = (read_run(runs / name) for name in ("second", "both"))
@@ -107,6 +110,19 @@ def atlas(numbers: tuple[int, ...], *words: str) -> Atlas:
     return mapped(frames, prior_of(frames, *words), words=words).atlas
 
 
+def test_two_walks_past_the_same_things_become_one_map_along_the_true_path():
+    """The prior is exact, in a unit that is not that of the first for the second."""
+    one = atlas(tuple(range(0, 24, 2)))
+    frames = walk(range(1, 25, 2))
+    found = join(one, mapped(frames, Scaled(prior_of(frames))).atlas)
+    assert isinstance(found, Atlas), found
+    truth = np.stack([frame.T_world_camera for part in (walk(range(0, 24, 2)), frames) for frame in part])
+    poses = np.stack([node.pose for node in found.graph.nodes])
+    assert pose_difference(poses, poses[0] @ np.linalg.inv(truth[0]) @ truth)[0].max() < 0.05
+    alone, both = (int(part.state.map.gaussians.valid.sum()) for part in (one, found))
+    assert alone < both < 1.7 * alone, "one layer, where both saw it"
+
+
 TWINS = ("dataset=apartment", "dataset.walk=twin_rooms", "dataset.num_frames=null", "dataset.stop=null")
 
 
@@ -114,7 +130,7 @@ TWINS = ("dataset=apartment", "dataset.walk=twin_rooms", "dataset.num_frames=nul
     ("one", "other", "words", "reason"),
     [
         (range(0, 10, 2), range(60, 50, -2), (), "no keyframe shows the same place"),
-        (range(0, 240, 10), range(290, 530, 10), TWINS, "see"),
+        pytest.param(range(0, 240, 10), range(290, 530, 10), TWINS, "see", marks=pytest.mark.weekly),
     ],
 )
 def test_what_is_not_one_place_is_not_joined(one, other, words, reason):
@@ -122,6 +138,7 @@ def test_what_is_not_one_place_is_not_joined(one, other, words, reason):
     assert isinstance(found, str) and reason in found
 
 
+@pytest.mark.weekly
 @pytest.mark.parametrize(
     ("folders", "out", "message"),
     [

@@ -149,6 +149,7 @@ def test_poses_that_are_off_find_back_to_where_the_images_were_taken(tmp_path):
     assert before > 0.3 and max(after) < 0.2 * before
 
 
+@pytest.mark.weekly
 def test_gains_of_frames_are_told_from_colours(tmp_path):
     """The second frame is taken brighter and bluer; with one exposure for both, neither is drawn right."""
     ratio, sound, spool = np.array([1.2, 1.2, 1.4]), drawn_from(ANCHORS), Spool()
@@ -305,6 +306,7 @@ def test_what_is_held_out_never_enters_the_fit_and_the_files_say_what_came_out(f
     assert other["polish/before_psnr_db"] < found["polish/before_psnr_db"] - 3, "they are what is compared"
 
 
+@pytest.mark.weekly
 def test_what_was_taken_for_moving_enters_no_fit(folder):
     """Noise there, in the images of fitted frames: the splats are those without it."""
     from experiments.report import images_of
@@ -331,6 +333,7 @@ def test_what_was_taken_for_moving_enters_no_fit(folder):
     assert splats[0] == splats[1]
 
 
+@pytest.mark.weekly
 def test_a_run_can_end_with_it_and_says_at_once_that_optax_is_missing(exact_run, tmp_path, monkeypatch, capsys):
     """The map is that of the run without it, and the splats are those of the command."""
     own, short = tmp_path / "own", SHORT + ("polish=default",)

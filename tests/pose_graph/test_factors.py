@@ -84,6 +84,14 @@ def test_what_is_not_in_use_is_zero_with_finite_derivatives(double):
         np.testing.assert_array_equal(np.asarray(filled)[-2:], 0.0)
 
 
+@pytest.mark.parametrize(("end", "row"), [("a", -1), ("b", -1), ("a", 9), ("b", 9)])
+def test_an_edge_to_a_node_that_is_not_there_is_not_in_use(end, row):
+    graph = small_graph()
+    edges = put(graph.factors, **{end: lambda rows: np.where(np.arange(len(rows)) == 0, row, rows)})
+    in_use = factors.factors_in_use(PoseGraph(graph.nodes, edges))
+    np.testing.assert_array_equal(in_use, np.arange(len(in_use)) > 0)
+
+
 def test_the_kernel_s_weight_is_the_derivative_of_its_cost(double):
     chi2 = np.array([0.0, 1.0, 16.7, 16.9, 40.0, 1e4, 1e8])
     is_loop, phi = np.ones(7, bool), 16.8

@@ -285,6 +285,7 @@ def closures():
     return found
 
 
+@pytest.mark.slow
 def test_ten_false_loops_among_thirty_hardly_matter(closures):
     before, clean, spoilt, weights = map(np.array, zip(*closures, strict=True))
     assert (spoilt <= 1.1 * clean).all()
@@ -300,6 +301,7 @@ def drifted(num_nodes: int, seed: int) -> tuple[Nodes, PoseGraph]:
     return truth, PoseGraph(chain(truth, edges), edges)
 
 
+@pytest.mark.slow
 def test_spreading_the_errors_first_keeps_true_loops_after_metres_of_drift():
     """From the chain itself the kernel refuses one of the three."""
     truth, graph = drifted(200, 0)
@@ -321,6 +323,7 @@ def stretched(num_nodes: int, seed: int) -> tuple[Nodes, PoseGraph]:
     return truth, PoseGraph(chain(truth, edges), edges)
 
 
+@pytest.mark.slow
 def test_where_a_loop_would_be_left_out_the_search_begins_with_all_of_them_in_full_too():
     """Errors spread over poses know nothing of the scale: from there the kernel refuses true loops."""
     truth, graph = stretched(160, 2)

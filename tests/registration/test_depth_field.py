@@ -90,6 +90,7 @@ def test_little_that_is_known_corrects_little(valid) -> None:
         assert not found(0.1, valid=valid).any()
 
 
+@pytest.mark.slow
 def test_gradients_are_finite() -> None:
     def total(errors, points):
         return jnp.sum(

@@ -81,6 +81,7 @@ def said_again(before: Repeats, prediction: Prediction, scale: float = 1.0) -> t
     return repeats, latest
 
 
+@pytest.mark.slow
 def test_the_deviations_are_those_of_the_answers():
     """400 frames whose answers have three quarters of their variance in common."""
     rng, shared, repeats = np.random.default_rng(0), 0.75, no_repeats()

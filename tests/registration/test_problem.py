@@ -49,6 +49,7 @@ def noisy_problem():
     return matches, eqx.tree_at(fields, problem, tuple(map(device, (noisy, valid, np.ones(7), 1.0))))
 
 
+@pytest.mark.slow
 def test_noise_along_the_rays_pulls_the_scale_nowhere(config):
     """The gradient by log s of half of the squares is Σ (ε² - ε²) = 0 for points p (1 + ν ε).
 

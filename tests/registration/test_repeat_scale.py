@@ -69,6 +69,7 @@ def test_without_a_pair_the_other_scale_stands():
         assert scale == pytest.approx(0.8) and np.isfinite(std)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("poison", [0.0, np.nan, 1e30])
 def test_a_row_that_is_no_point_says_nothing(poison):
     """A depth of 0 in both predictions made the error of the scale, and with it the whole state, NaN."""

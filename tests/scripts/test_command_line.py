@@ -130,7 +130,6 @@ def test_the_help_of_a_run_lists_exactly_the_choices_that_there_are(monkeypatch,
         for name, words in lines.items()
         if name in own
     }
-    own["baseline"].remove("smoke")  # a file of the gate, which is no option
     for shared in ("checked", "matched", "monocular"):  # what ways to depth have in common
         own["prior/dense"].remove(shared)
     of_other_commands = {"densify_on", "experiment_on", "protocol", "suite"}
@@ -219,7 +218,7 @@ def test_no_help_imports_what_computes():
 
 
 def test_what_has_to_be_given_is_named_with_the_command_or_its_options():
-    for name in ("view", "report", "export", "effects"):
+    for name in ("view", "report", "export"):
         with pytest.raises(ValueError, match=f"^folder is not given .*: emgs {name} folder=…$"):
             check_missing(name, compose(name=name))
     check_missing("view", compose("folder=x", name="view"))

@@ -115,6 +115,7 @@ def test_the_command_writes_the_same_bytes_again_and_baselines_stand_beside_ours
     assert {key: metrics[key] for key in same} == {key: exact_run[1][key] for key in same}
 
 
+@pytest.mark.slow
 def test_a_back_end_moves_nothing_that_is_exact_and_writes_what_it_measured(tmp_path, exact_run):
     metrics = experiments.run.run(compose("prior.level=0", "graph=default"), tmp_path)
     assert {path.name for path in tmp_path.iterdir()} >= FILES | {"trajectory_online.txt", "graph.g2o", "loops.json"}
@@ -179,6 +180,7 @@ def test_an_interrupted_run_leaves_what_it_has(tmp_path, monkeypatch, exact_run)
     assert int(map.gaussians.valid.sum()) == records[-1]["num_gaussians"]
 
 
+@pytest.mark.slow
 def test_a_bad_frame_is_left_out_and_listed_or_ends_the_run(tmp_path, monkeypatch):
     read = Synthetic.__getitem__
 

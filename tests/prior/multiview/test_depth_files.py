@@ -24,6 +24,9 @@ from emgs_jax.prior.multiview.landmarks import landmarks_of, point_information
 from emgs_jax.prior.multiview.lens import Lens
 from emgs_jax.structure.model import Structure, World
 
+pytestmark = pytest.mark.slow
+
+
 STEMS = ["a 1", "a 2", "a 10"]
 VALUES = np.float32(np.random.default_rng(0).uniform(0.1, 1.0, (3, 6, 8)))
 

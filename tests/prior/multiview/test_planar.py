@@ -9,6 +9,9 @@ from stereo_scene import CENTER, SIZE, depth_config, painted, planar_config, sma
 from emgs_jax.prior.multiview.depth import estimate_depth
 from emgs_jax.prior.multiview.planar import _prediction_std, blank_regions, fill_planes, fit_plane
 
+pytestmark = pytest.mark.slow
+
+
 WIDTH, HEIGHT = SIZE
 SPACING = 0.03  # 1/m, of the planes of the sweep
 V, U = np.mgrid[:HEIGHT, :WIDTH]
