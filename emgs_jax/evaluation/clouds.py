@@ -138,11 +138,12 @@ class SpooledRows:
     """
 
     def __init__(self, dtype: type = np.float32) -> None:
-        self._parts, self._some, self._count, self._dtype = Spool(), [np.empty((0, 3), dtype)], 0, dtype
+        self._parts, self._some, self._count, self.dtype = Spool(), [np.empty((0, 3), dtype)], 0, dtype
 
     def append(self, rows: np.ndarray) -> None:
         """Add some rows."""
-        rows = rows[np.isfinite(rows[:, :3]).all(axis=1)].astype(self._dtype)
+        is_finite = np.isfinite(rows[:, 0]) & np.isfinite(rows[:, 1]) & np.isfinite(rows[:, 2])
+        rows = (rows if is_finite.all() else rows[is_finite]).astype(self.dtype, copy=False)
         self._parts.append(rows)
         self._some.append(rows[::SOME, :3].copy())
         self._count += len(rows)
@@ -161,11 +162,15 @@ class SpooledRows:
         """
         numbers, num_parts = np.sort(cell_numbers(np.concatenate(self._some), voxel)), -(-len(self) // PART_ROWS)
         edges = numbers[len(numbers) * np.arange(1, num_parts) // max(num_parts, 1)]
+        if not len(edges):  # one range holds all of them
+            parts = [read(self._parts[part])[1] for part in range(len(self._parts))]
+            yield from [np.concatenate(parts)] if parts else ()
+            return
         spread, places = Spool(), [[] for _ in range(len(edges) + 1)]
         for part in range(len(self._parts)):
             cells, rows = read(self._parts[part])
-            which = np.searchsorted(edges, cells, side="right")
-            order = np.argsort(which, kind="stable")
+            which = np.searchsorted(edges, cells, side="right").astype(np.uint16)
+            order = np.argsort(which, kind="stable")  # 16 bits are sorted digit by digit
             ends = np.cumsum(np.bincount(which, minlength=len(places)))
             for place, own in zip(places, np.split(order, ends[:-1]), strict=True):
                 if len(own):
@@ -184,7 +189,9 @@ class SpooledCloud:
 
     def append(self, cloud: PointCloud) -> None:
         """Add the points of a cloud."""
-        self._rows.append(np.concatenate([cloud.points, cloud.normals, cloud.colors], axis=1))
+        rows = np.empty((len(cloud), 9), self._rows.dtype)
+        rows[:, :3], rows[:, 3:6], rows[:, 6:] = cloud.points, cloud.normals, cloud.colors
+        self._rows.append(rows)
         self._averaged = None
 
     def __len__(self) -> int:
@@ -234,9 +241,14 @@ def cell_numbers(points: np.ndarray, voxel: float) -> np.ndarray:
 
     What is farther than a million voxels shares the border cells.
     """
-    cells = np.asarray(points, np.float64) / voxel
-    index = np.floor(np.clip(cells, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
-    return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+    numbers = np.zeros(len(points), np.int64)
+    for axis in range(3):  # column by column, as there may be millions of rows
+        cells = np.asarray(points[:, axis], np.float64) / voxel
+        np.floor(cells, out=cells)
+        np.clip(cells, -(2.0**20), 2.0**20 - 1, out=cells)
+        numbers <<= 21
+        numbers |= cells.astype(np.int64) + 2**20
+    return numbers
 
 
 def cell_centers(numbers: np.ndarray, voxel: float) -> np.ndarray:
@@ -253,7 +265,9 @@ class NearestPoints:
 
     def __init__(self, points: np.ndarray) -> None:
         self.points = np.ascontiguousarray(points, np.float64)
-        self._tree = cKDTree(self.points, balanced_tree=False)
+        # `compact_nodes` would shrink each node to its points: a query that is far from all of them then visits ten
+        # times as many leaves, with the same answer.
+        self._tree = cKDTree(self.points, leafsize=32, balanced_tree=False, compact_nodes=False)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -301,7 +315,8 @@ def _means(rows: np.ndarray, voxel: float) -> np.ndarray:
 def _sum_cells(keys: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sum the rows (n, c) of equal keys (n,) to float64, in the order in which they stand."""
     order = np.argsort(keys, kind="stable")
-    begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    keys = keys[order]
+    begins = np.flatnonzero(np.diff(keys, prepend=-1))
     # A sparse matrix that picks the rows of each cell: whole rows are read once, whatever the number of columns.
     picks = csr_array((np.ones(len(keys)), order, np.append(begins, len(keys))), shape=(len(begins), len(keys)))
-    return keys[order][begins], picks @ rows
+    return keys[begins], picks @ rows

@@ -45,7 +45,7 @@ class EvaluationConfig:
     icp_max_steps: int = number(low=0, high=10000)
     voxel_m: float = number(low=1e-4)
     max_points: int | None = number(low=1, high=1e9)  # compare a random choice of so many points of each cloud
-    num_sampled: int = number(low=1, high=1e9)  # points of the estimate whose distances to the truth are taken
+    num_sampled: int = number(low=1, high=1e9)  # points of either cloud whose distances to all of the other are taken
     f1_thresholds_m: tuple[float, ...] = number(low=1e-9)
     max_normal_angle_deg: float = number(low=0, high=180)
     normal_radius_px: int = number(low=1, high=64)
@@ -182,19 +182,18 @@ def reconstruction_metrics(estimate: PointCloud, truth: Reference, config: Evalu
 
     Both clouds are averaged per voxel. Accuracy (estimate → truth) and completion (truth → estimate) are the
     protocol's statistic of the distances to the nearest point; unless it clips them, one far outlier counts in full.
-    Accuracy and precision are those of `num_sampled` points of the estimate, evenly spread over its voxels; completion
-    and recall of all of the truth to all of the estimate. The normal metrics take the nearest neighbours' |cos| and
-    average both directions. Without points the values are None, with a reason.
+    Accuracy and precision are those of `num_sampled` points of the estimate, evenly spread over its voxels, to all of
+    the truth; completion and recall likewise of the truth to all of the estimate. The normal metrics take the nearest
+    neighbours' |cos| and average both directions. Without points the values are None, with a reason.
     """
     return _compare(spooled([estimate], np.float64).averaged(config.voxel_m), truth, config)
 
 
 def _compare(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> Metrics:
     """`reconstruction_metrics` of an estimate that is averaged already."""
-    empty: Metrics = dict.fromkeys(_metric_names(config)) | {"reconstruction/num_points": len(means)}
     if not len(means) or not len(truth.cloud):
-        which = "estimate" if not len(means) else "ground truth"
-        return empty | {"reconstruction/reason": f"the {which} has no points"}
+        which = "ground truth" if len(means) else "estimate"
+        return not_compared(config, f"the {which} has no points", len(means))
     rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
     is_whole = config.max_points is None
     rows = _spread(len(means), config.num_sampled, rng) if is_whole else _choice(len(means), config.max_points, rng)
@@ -203,10 +202,18 @@ def _compare(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> M
     normals, of_truth = truth.cloud.normals[kept], truth.points
     if len(kept) < len(truth.cloud):
         of_truth = NearestPoints(truth.cloud.points[kept])
-    to_estimate, seen = _nearest_means(parts, some, of_truth.points)
+    asked = _spread(len(of_truth), config.num_sampled, rng) if is_whole else slice(None)
+    to_estimate, seen = _nearest_means(parts, some, of_truth.points[asked])
     to_truth, partners = (values[:, 0] for values in of_truth.query(some[:, :3]))
-    cosines = _abs_cosines(some[:, 3:6], normals[partners]), _abs_cosines(seen, normals)
-    return empty | _scores((to_truth, to_estimate), cosines, config)
+    cosines = _abs_cosines(some[:, 3:6], normals[partners]), _abs_cosines(seen, normals[asked])
+    scores = _scores((to_truth, to_estimate), cosines, config)
+    return dict.fromkeys(_metric_names(config)) | {"reconstruction/num_points": len(means)} | scores
+
+
+def not_compared(config: EvaluationConfig, reason: str, num_points: int | None = None) -> Metrics:
+    """The keys of a comparison without values, and the reason why there is none."""
+    found: Metrics = dict.fromkeys(_metric_names(config))
+    return found | {"reconstruction/num_points": num_points, "reconstruction/reason": reason}
 
 
 def _scores(distances: Sequence[np.ndarray], cosines: Sequence[np.ndarray], config: EvaluationConfig) -> Metrics:
