@@ -94,12 +94,13 @@ def transform_cloud(cloud: PointCloud, alignment: Sim3) -> PointCloud:
 class VoxelMeans:
     """The mean of each occupied voxel of a cloud, in parts that need not be in memory together.
 
-    A part has rows (n, 10): point, normal (unit length, or zero), colour, and how many points there were. They are by
-    the number of their cell, in one part and from part to part.
+    A part has rows (n, 10): point, normal (unit length, or zero), colour, and how many points there were; or (n, 7)
+    without colours. They are by the number of their cell, in one part and from part to part.
     """
 
     parts: Spool
     sizes: tuple[int, ...]  # rows of each part
+    width: int = 10  # columns
 
     def __len__(self) -> int:
         return sum(self.sizes)
@@ -112,14 +113,14 @@ class VoxelMeans:
         return map(_cloud, self.tables())
 
     def rows(self, positions: np.ndarray) -> np.ndarray:
-        """Rows (m, 10) at positions (m,) in ascending order."""
+        """Rows (m, `width`) at positions (m,) in ascending order."""
         begins = np.cumsum((0, *self.sizes))
         ends = np.searchsorted(positions, begins)
         found = [
             part[positions[first:last] - begin]
             for part, begin, first, last in zip(self.tables(), begins, ends, ends[1:], strict=False)
         ]
-        return np.concatenate([np.empty((0, 10), np.float32), *found])
+        return np.concatenate([np.empty((0, self.width), np.float32), *found])
 
     def cloud(self) -> PointCloud:
         """All of them."""
@@ -127,7 +128,7 @@ class VoxelMeans:
 
     def counts(self) -> np.ndarray:
         """Count the points of each row of `cloud`."""
-        return np.concatenate([np.empty(0), *(part[:, 9] for part in self.tables())])
+        return np.concatenate([np.empty(0), *(part[:, -1] for part in self.tables())])
 
 
 class SpooledRows:
@@ -180,17 +181,18 @@ class SpooledRows:
 
 
 class SpooledCloud:
-    """All points of many clouds as `SpooledRows` (n, 9) of `dtype`: point, normal, colour."""
+    """All points of many clouds as `SpooledRows` (n, 9) of `dtype`: point, normal, colour; (n, 6) without colours."""
 
-    def __init__(self, dtype: type = np.float32) -> None:
-        self._rows = SpooledRows(dtype)
+    def __init__(self, dtype: type = np.float32, has_colors: bool = True) -> None:
+        self._rows, self._width = SpooledRows(dtype), 9 if has_colors else 6
         self._averaged: tuple[float, VoxelMeans] | None = None  # the last answer: one alignment serves several numbers
         self._averaging = threading.Lock()
 
     def append(self, cloud: PointCloud) -> None:
         """Add the points of a cloud."""
-        rows = np.empty((len(cloud), 9), self._rows.dtype)
-        rows[:, :3], rows[:, 3:6], rows[:, 6:] = cloud.points, cloud.normals, cloud.colors
+        rows = np.empty((len(cloud), self._width), self._rows.dtype)
+        rows[:, :3], rows[:, 3:6] = cloud.points, cloud.normals
+        rows[:, 6:] = cloud.colors[:, : self._width - 6]
         self._rows.append(rows)
         self._averaged = None
 
@@ -205,13 +207,13 @@ class SpooledCloud:
                 for rows in self._rows.by_ranges(voxel, lambda rows: (cell_numbers(rows[:, :3], voxel), rows)):
                     means.append(found := _means(rows, voxel))
                     sizes.append(len(found))
-                self._averaged = voxel, VoxelMeans(means, tuple(sizes))
+                self._averaged = voxel, VoxelMeans(means, tuple(sizes), self._width + 1)
             return self._averaged[1]
 
 
-def spooled(clouds: Iterable[PointCloud], dtype: type = np.float32) -> SpooledCloud:
+def spooled(clouds: Iterable[PointCloud], dtype: type = np.float32, has_colors: bool = True) -> SpooledCloud:
     """The points of all clouds, one in memory at a time."""
-    found = SpooledCloud(dtype)
+    found = SpooledCloud(dtype, has_colors)
     for cloud in clouds:
         found.append(cloud)
     return found
@@ -303,9 +305,9 @@ def _cloud(rows: np.ndarray) -> PointCloud:
 
 
 def _means(rows: np.ndarray, voxel: float) -> np.ndarray:
-    """Rows of `VoxelMeans` of points with attributes (n, 9), of their precision."""
+    """Rows of `VoxelMeans` of points with attributes (n, 9) or (n, 6), of their precision."""
     _, sums = _sum_cells(cell_numbers(rows[:, :3], voxel), np.column_stack([rows, np.ones(len(rows))]))
-    sums[:, :9] /= sums[:, 9:]
+    sums[:, :-1] /= sums[:, -1:]
     length = np.linalg.norm(sums[:, 3:6], axis=1, keepdims=True)
     # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
     sums[:, 3:6] = np.where(length > 0.1, sums[:, 3:6] / np.maximum(length, 0.1), 0.0)

@@ -150,7 +150,8 @@ def compare_placements(
     found: dict[float, Metrics] = {}
     for distance in {*icp_distances_m}:
         placed = _moved(source, truth, distance, config) @ alignment
-        means = spooled((transform_cloud(part, placed) for part in own), precision).averaged(config.voxel_m)
+        moved = spooled((transform_cloud(part, placed) for part in own), precision, has_colors=False)
+        means = moved.averaged(config.voxel_m)
         found[distance] = _compare(means, truth, config) | {"reconstruction/alignment_note": note}
     return [found[distance] for distance in icp_distances_m]
 
@@ -186,7 +187,7 @@ def reconstruction_metrics(estimate: PointCloud, truth: Reference, config: Evalu
     the truth; completion and recall likewise of the truth to all of the estimate. The normal metrics take the nearest
     neighbours' |cos| and average both directions. Without points the values are None, with a reason.
     """
-    return _compare(spooled([estimate], np.float64).averaged(config.voxel_m), truth, config)
+    return _compare(spooled([estimate], np.float64, has_colors=False).averaged(config.voxel_m), truth, config)
 
 
 def _compare(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> Metrics:
@@ -234,7 +235,7 @@ def _scores(distances: Sequence[np.ndarray], cosines: Sequence[np.ndarray], conf
 def _nearest_means(parts: Iterable[np.ndarray], some: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance of each point (m, 3) to the nearest mean, and the normal (m, 3) there.
 
-    A part of the means is searched for those points that are nearer to it than to `some` (n, 10) of all parts.
+    A part of the means is searched for those points that are nearer to it than to `some` (n, 7) of all parts.
     """
     distances, rows = (values[:, 0] for values in NearestPoints(some[:, :3]).query(points))
     normals, x = some[rows, 3:6], points[:, 0]
