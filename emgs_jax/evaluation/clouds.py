@@ -94,12 +94,13 @@ def transform_cloud(cloud: PointCloud, alignment: Sim3) -> PointCloud:
 class VoxelMeans:
     """The mean of each occupied voxel of a cloud, in parts that need not be in memory together.
 
-    A part has rows (n, 10): point, normal (unit length, or zero), colour, and how many points there were. They are by
-    the number of their cell, in one part and from part to part.
+    A part has rows (n, 10): point, normal (unit length, or zero), colour, and how many points there were; or (n, 7)
+    without colours. They are by the number of their cell, in one part and from part to part.
     """
 
     parts: Spool
     sizes: tuple[int, ...]  # rows of each part
+    width: int = 10  # columns
 
     def __len__(self) -> int:
         return sum(self.sizes)
@@ -112,14 +113,14 @@ class VoxelMeans:
         return map(_cloud, self.tables())
 
     def rows(self, positions: np.ndarray) -> np.ndarray:
-        """Rows (m, 10) at positions (m,) in ascending order."""
+        """Rows (m, `width`) at positions (m,) in ascending order."""
         begins = np.cumsum((0, *self.sizes))
         ends = np.searchsorted(positions, begins)
         found = [
             part[positions[first:last] - begin]
             for part, begin, first, last in zip(self.tables(), begins, ends, ends[1:], strict=False)
         ]
-        return np.concatenate([np.empty((0, 10), np.float32), *found])
+        return np.concatenate([np.empty((0, self.width), np.float32), *found])
 
     def cloud(self) -> PointCloud:
         """All of them."""
@@ -127,7 +128,7 @@ class VoxelMeans:
 
     def counts(self) -> np.ndarray:
         """Count the points of each row of `cloud`."""
-        return np.concatenate([np.empty(0), *(part[:, 9] for part in self.tables())])
+        return np.concatenate([np.empty(0), *(part[:, -1] for part in self.tables())])
 
 
 class SpooledRows:
@@ -138,11 +139,12 @@ class SpooledRows:
     """
 
     def __init__(self, dtype: type = np.float32) -> None:
-        self._parts, self._some, self._count, self._dtype = Spool(), [np.empty((0, 3), dtype)], 0, dtype
+        self._parts, self._some, self._count, self.dtype = Spool(), [np.empty((0, 3), dtype)], 0, dtype
 
     def append(self, rows: np.ndarray) -> None:
         """Add some rows."""
-        rows = rows[np.isfinite(rows[:, :3]).all(axis=1)].astype(self._dtype)
+        is_finite = np.isfinite(rows[:, 0]) & np.isfinite(rows[:, 1]) & np.isfinite(rows[:, 2])
+        rows = (rows if is_finite.all() else rows[is_finite]).astype(self.dtype, copy=False)
         self._parts.append(rows)
         self._some.append(rows[::SOME, :3].copy())
         self._count += len(rows)
@@ -161,11 +163,15 @@ class SpooledRows:
         """
         numbers, num_parts = np.sort(cell_numbers(np.concatenate(self._some), voxel)), -(-len(self) // PART_ROWS)
         edges = numbers[len(numbers) * np.arange(1, num_parts) // max(num_parts, 1)]
+        if not len(edges):  # one range holds all of them
+            parts = [read(self._parts[part])[1] for part in range(len(self._parts))]
+            yield from [np.concatenate(parts)] if parts else ()
+            return
         spread, places = Spool(), [[] for _ in range(len(edges) + 1)]
         for part in range(len(self._parts)):
             cells, rows = read(self._parts[part])
-            which = np.searchsorted(edges, cells, side="right")
-            order = np.argsort(which, kind="stable")
+            which = np.searchsorted(edges, cells, side="right").astype(np.uint16)
+            order = np.argsort(which, kind="stable")  # 16 bits are sorted digit by digit
             ends = np.cumsum(np.bincount(which, minlength=len(places)))
             for place, own in zip(places, np.split(order, ends[:-1]), strict=True):
                 if len(own):
@@ -175,16 +181,19 @@ class SpooledRows:
 
 
 class SpooledCloud:
-    """All points of many clouds as `SpooledRows` (n, 9) of `dtype`: point, normal, colour."""
+    """All points of many clouds as `SpooledRows` (n, 9) of `dtype`: point, normal, colour; (n, 6) without colours."""
 
-    def __init__(self, dtype: type = np.float32) -> None:
-        self._rows = SpooledRows(dtype)
+    def __init__(self, dtype: type = np.float32, has_colors: bool = True) -> None:
+        self._rows, self._width = SpooledRows(dtype), 9 if has_colors else 6
         self._averaged: tuple[float, VoxelMeans] | None = None  # the last answer: one alignment serves several numbers
         self._averaging = threading.Lock()
 
     def append(self, cloud: PointCloud) -> None:
         """Add the points of a cloud."""
-        self._rows.append(np.concatenate([cloud.points, cloud.normals, cloud.colors], axis=1))
+        rows = np.empty((len(cloud), self._width), self._rows.dtype)
+        rows[:, :3], rows[:, 3:6] = cloud.points, cloud.normals
+        rows[:, 6:] = cloud.colors[:, : self._width - 6]
+        self._rows.append(rows)
         self._averaged = None
 
     def __len__(self) -> int:
@@ -198,13 +207,13 @@ class SpooledCloud:
                 for rows in self._rows.by_ranges(voxel, lambda rows: (cell_numbers(rows[:, :3], voxel), rows)):
                     means.append(found := _means(rows, voxel))
                     sizes.append(len(found))
-                self._averaged = voxel, VoxelMeans(means, tuple(sizes))
+                self._averaged = voxel, VoxelMeans(means, tuple(sizes), self._width + 1)
             return self._averaged[1]
 
 
-def spooled(clouds: Iterable[PointCloud], dtype: type = np.float32) -> SpooledCloud:
+def spooled(clouds: Iterable[PointCloud], dtype: type = np.float32, has_colors: bool = True) -> SpooledCloud:
     """The points of all clouds, one in memory at a time."""
-    found = SpooledCloud(dtype)
+    found = SpooledCloud(dtype, has_colors)
     for cloud in clouds:
         found.append(cloud)
     return found
@@ -234,9 +243,14 @@ def cell_numbers(points: np.ndarray, voxel: float) -> np.ndarray:
 
     What is farther than a million voxels shares the border cells.
     """
-    cells = np.asarray(points, np.float64) / voxel
-    index = np.floor(np.clip(cells, -(2.0**20), 2.0**20 - 1)).astype(np.int64) + 2**20
-    return (index[:, 0] << 42) | (index[:, 1] << 21) | index[:, 2]
+    numbers = np.zeros(len(points), np.int64)
+    for axis in range(3):  # column by column, as there may be millions of rows
+        cells = np.asarray(points[:, axis], np.float64) / voxel
+        np.floor(cells, out=cells)
+        np.clip(cells, -(2.0**20), 2.0**20 - 1, out=cells)
+        numbers <<= 21
+        numbers |= cells.astype(np.int64) + 2**20
+    return numbers
 
 
 def cell_centers(numbers: np.ndarray, voxel: float) -> np.ndarray:
@@ -253,7 +267,9 @@ class NearestPoints:
 
     def __init__(self, points: np.ndarray) -> None:
         self.points = np.ascontiguousarray(points, np.float64)
-        self._tree = cKDTree(self.points, balanced_tree=False)
+        # `compact_nodes` would shrink each node to its points: a query that is far from all of them then visits ten
+        # times as many leaves, with the same answer.
+        self._tree = cKDTree(self.points, leafsize=32, balanced_tree=False, compact_nodes=False)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -289,9 +305,9 @@ def _cloud(rows: np.ndarray) -> PointCloud:
 
 
 def _means(rows: np.ndarray, voxel: float) -> np.ndarray:
-    """Rows of `VoxelMeans` of points with attributes (n, 9), of their precision."""
+    """Rows of `VoxelMeans` of points with attributes (n, 9) or (n, 6), of their precision."""
     _, sums = _sum_cells(cell_numbers(rows[:, :3], voxel), np.column_stack([rows, np.ones(len(rows))]))
-    sums[:, :9] /= sums[:, 9:]
+    sums[:, :-1] /= sums[:, -1:]
     length = np.linalg.norm(sums[:, 3:6], axis=1, keepdims=True)
     # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
     sums[:, 3:6] = np.where(length > 0.1, sums[:, 3:6] / np.maximum(length, 0.1), 0.0)
@@ -301,7 +317,8 @@ def _means(rows: np.ndarray, voxel: float) -> np.ndarray:
 def _sum_cells(keys: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Sum the rows (n, c) of equal keys (n,) to float64, in the order in which they stand."""
     order = np.argsort(keys, kind="stable")
-    begins = np.flatnonzero(np.diff(keys[order], prepend=-1))
+    keys = keys[order]
+    begins = np.flatnonzero(np.diff(keys, prepend=-1))
     # A sparse matrix that picks the rows of each cell: whole rows are read once, whatever the number of columns.
     picks = csr_array((np.ones(len(keys)), order, np.append(begins, len(keys))), shape=(len(begins), len(keys)))
-    return keys[order][begins], picks @ rows
+    return keys[begins], picks @ rows

@@ -37,9 +37,8 @@ class EvaluationConfig:
     protocol: str
     alignment: str = one_of("sim3", "se3", default="sim3")  # se3: without the scale
     statistic: str = one_of("mean", "rmse", default="mean")  # of the distances
-    max_distance_m: float = number(
-        math.inf, low=1e-6, high=math.inf
-    )  # longer distances count as this long; F1 does not change
+    # longer distances count as this long; F1 does not change
+    max_distance_m: float = number(math.inf, low=1e-6, high=math.inf)
     max_depth_m: float = number(math.inf, low=1e-6, high=math.inf)  # true depth farther away is left out
     icp_distance_m: float = number(0.0, low=0)  # ICP after the alignment takes pairs within this distance; 0 = no ICP
     placement_icp_m: float = number(0.1, low=1e-6)  # likewise for reconstruction_icp/…, whatever the protocol does
@@ -47,14 +46,13 @@ class EvaluationConfig:
     icp_max_steps: int = number(30, low=0, high=10000)
     voxel_m: float = number(0.01, low=1e-4)
     max_points: int | None = number(None, low=1, high=1e9)  # compare a random choice of so many points of each cloud
-    num_sampled: int = number(1000000, low=1, high=1e9)  # points of the estimate whose distances to the truth are taken
+    num_sampled: int = number(400000, low=1, high=1e9)  # of either cloud, whose distances to all of the other are taken
     f1_thresholds_m: tuple[float, ...] = number((0.2, 0.05), low=1e-9)
     max_normal_angle_deg: float = number(30.0, low=0, high=180)
     normal_radius_px: int = number(4, low=1, high=64)
     normal_step_px: int = number(2, low=1, high=64)
-    max_normal_gap: float = number(
-        0.1, low=0, high=math.inf
-    )  # relative inverse-depth step to a tap of the normal's window
+    # relative inverse-depth step to a tap of the normal's window
+    max_normal_gap: float = number(0.1, low=0, high=math.inf)
     max_normal_residual: float = number(0.02, low=0, high=math.inf)  # likewise, distance of a tap from the fitted plane
     min_normal_taps: int = number(8, low=3, high=1000)
     label_neighbours: int = number(5, low=1, high=1000)  # nearest points of the map that vote for a true point's label
@@ -154,7 +152,8 @@ def compare_placements(
     found: dict[float, Metrics] = {}
     for distance in {*icp_distances_m}:
         placed = _moved(source, truth, distance, config) @ alignment
-        means = spooled((transform_cloud(part, placed) for part in own), precision).averaged(config.voxel_m)
+        moved = spooled((transform_cloud(part, placed) for part in own), precision, has_colors=False)
+        means = moved.averaged(config.voxel_m)
         found[distance] = _compare(means, truth, config) | {"reconstruction/alignment_note": note}
     return [found[distance] for distance in icp_distances_m]
 
@@ -186,19 +185,18 @@ def reconstruction_metrics(estimate: PointCloud, truth: Reference, config: Evalu
 
     Both clouds are averaged per voxel. Accuracy (estimate → truth) and completion (truth → estimate) are the
     protocol's statistic of the distances to the nearest point; unless it clips them, one far outlier counts in full.
-    Accuracy and precision are those of `num_sampled` points of the estimate, evenly spread over its voxels; completion
-    and recall of all of the truth to all of the estimate. The normal metrics take the nearest neighbours' |cos| and
-    average both directions. Without points the values are None, with a reason.
+    Accuracy and precision are those of `num_sampled` points of the estimate, evenly spread over its voxels, to all of
+    the truth; completion and recall likewise of the truth to all of the estimate. The normal metrics take the nearest
+    neighbours' |cos| and average both directions. Without points the values are None, with a reason.
     """
-    return _compare(spooled([estimate], np.float64).averaged(config.voxel_m), truth, config)
+    return _compare(spooled([estimate], np.float64, has_colors=False).averaged(config.voxel_m), truth, config)
 
 
 def _compare(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> Metrics:
     """`reconstruction_metrics` of an estimate that is averaged already."""
-    empty: Metrics = dict.fromkeys(_metric_names(config)) | {"reconstruction/num_points": len(means)}
     if not len(means) or not len(truth.cloud):
-        which = "estimate" if not len(means) else "ground truth"
-        return empty | {"reconstruction/reason": f"the {which} has no points"}
+        which = "ground truth" if len(means) else "estimate"
+        return not_compared(config, f"the {which} has no points", len(means))
     rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
     is_whole = config.max_points is None
     rows = _spread(len(means), config.num_sampled, rng) if is_whole else _choice(len(means), config.max_points, rng)
@@ -207,10 +205,18 @@ def _compare(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> M
     normals, of_truth = truth.cloud.normals[kept], truth.points
     if len(kept) < len(truth.cloud):
         of_truth = NearestPoints(truth.cloud.points[kept])
-    to_estimate, seen = _nearest_means(parts, some, of_truth.points)
+    asked = _spread(len(of_truth), config.num_sampled, rng) if is_whole else slice(None)
+    to_estimate, seen = _nearest_means(parts, some, of_truth.points[asked])
     to_truth, partners = (values[:, 0] for values in of_truth.query(some[:, :3]))
-    cosines = _abs_cosines(some[:, 3:6], normals[partners]), _abs_cosines(seen, normals)
-    return empty | _scores((to_truth, to_estimate), cosines, config)
+    cosines = _abs_cosines(some[:, 3:6], normals[partners]), _abs_cosines(seen, normals[asked])
+    scores = _scores((to_truth, to_estimate), cosines, config)
+    return dict.fromkeys(_metric_names(config)) | {"reconstruction/num_points": len(means)} | scores
+
+
+def not_compared(config: EvaluationConfig, reason: str, num_points: int | None = None) -> Metrics:
+    """The keys of a comparison without values, and the reason why there is none."""
+    found: Metrics = dict.fromkeys(_metric_names(config))
+    return found | {"reconstruction/num_points": num_points, "reconstruction/reason": reason}
 
 
 def _scores(distances: Sequence[np.ndarray], cosines: Sequence[np.ndarray], config: EvaluationConfig) -> Metrics:
@@ -231,7 +237,7 @@ def _scores(distances: Sequence[np.ndarray], cosines: Sequence[np.ndarray], conf
 def _nearest_means(parts: Iterable[np.ndarray], some: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance of each point (m, 3) to the nearest mean, and the normal (m, 3) there.
 
-    A part of the means is searched for those points that are nearer to it than to `some` (n, 10) of all parts.
+    A part of the means is searched for those points that are nearer to it than to `some` (n, 7) of all parts.
     """
     distances, rows = (values[:, 0] for values in NearestPoints(some[:, :3]).query(points))
     normals, x = some[rows, 3:6], points[:, 0]

@@ -20,6 +20,7 @@ from emgs_jax.evaluation.reconstruction import (
     compare_clouds,
     compare_placements,
     ground_truth_cloud,
+    not_compared,
     reference,
 )
 from emgs_jax.evaluation.rendering import Rendered
@@ -40,7 +41,7 @@ from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.back_end import counts, found_loops
 from emgs_jax.report.gathering import Baselines, RawPrior, Text
-from emgs_jax.report.provenance import RAW_PRIOR, prefixed
+from emgs_jax.report.provenance import RAW_PRIOR, is_metric, prefixed
 
 Metrics = dict[str, Any]
 STATUSES = ("tracked", "degraded", "lost", APART, "initialization")
@@ -55,6 +56,11 @@ class Scorer:
     truth: Reference  # empty without ground truth
     labels: LabelledPoints | None  # the true classes; None where data set or prior have none
     prior: Prior | None  # its text embeddings are the classes of a map
+
+    @property
+    def is_metric(self) -> bool:
+        """The prior predicts in metres, as far as it says."""
+        return self.prior is None or is_metric(self.prior.provenance.settings)
 
 
 def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior) -> Scorer:
@@ -90,14 +96,19 @@ def score_map(
     """Trajectory, reconstruction and segmentation metrics of the map; empty without any true pose.
 
     The dense map is compared as the protocol says, under the other alignment as `reconstruction_<alignment>/…`,
-    placed by its points as `reconstruction_icp/…`, and the plain centres as `reconstruction_centers/…`.
+    placed by its points as `reconstruction_icp/…`, and the plain centres as `reconstruction_centers/…`. Without scale
+    it is not compared where the prior's unit is not the metre: the distances would say no more than that.
     """
     poses, truth, config = with_truth(run, run.poses), scorer.truth, scorer.evaluation
     if poses is None:
         return {}
     other = replace(config, alignment="se3" if config.alignment == "sim3" else "sim3")
     metrics = trajectory_metrics(*poses) | score_cloud(dense, poses, scorer)
-    metrics |= _renamed(compare_clouds(dense, truth, poses, other), f"reconstruction_{other.alignment}/")
+    if other.alignment == "sim3" or scorer.is_metric:
+        compared = compare_clouds(dense, truth, poses, other)
+    else:
+        compared = not_compared(other, "the prior's unit is not the metre") | {"reconstruction/alignment_note": None}
+    metrics |= _renamed(compared, f"reconstruction_{other.alignment}/")
     metrics |= _renamed(compare_clouds(centers, truth, poses, config), "reconstruction_centers/")
     return metrics | _score_labels(labels, poses, scorer)
 

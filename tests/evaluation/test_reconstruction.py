@@ -187,6 +187,16 @@ def test_a_sample_of_the_estimate_changes_its_accuracy_by_chance_and_its_complet
         assert 1e-6 < abs(np.subtract(*accuracy)) < 0.05 * expected["reconstruction/accuracy_m"]
 
 
+def test_a_sample_of_the_truth_is_searched_in_all_of_the_estimate():
+    """A completion by a thinned estimate is 25 % too large; one by fewer true points differs by chance."""
+    rng = np.random.default_rng(13)
+    truth, estimate = random_cloud(rng, 8000), random_cloud(rng, 4000)
+    whole = reconstruction_metrics(estimate, reference(truth, CONFIG), CONFIG)["reconstruction/completion_m"]
+    few = dataclasses.replace(CONFIG, num_sampled=2000)
+    found = reconstruction_metrics(estimate, reference(truth, few), few)["reconstruction/completion_m"]
+    assert 1e-6 < abs(found - whole) < 0.04 * whole
+
+
 def test_a_cloud_twice_as_long_takes_a_fraction_of_its_points_more(monkeypatch):
     """A point is 36 bytes on the disk; two placements of all points and their searches took 580 in memory."""
     monkeypatch.setattr("emgs_jax.evaluation.clouds.PART_ROWS", 5000)

@@ -135,6 +135,21 @@ def test_the_dense_map_is_also_compared_under_the_other_alignment(alignment, oth
     assert errors["sim3"] < 1e-9 < 0.1 < errors["se3"], "half the size is an error only where the scale counts"
 
 
+@pytest.mark.parametrize("alignment", ["sim3", "se3"])
+def test_a_map_whose_unit_is_not_the_metre_is_compared_without_scale_only_where_the_protocol_asks(alignment):
+    scene = Scene(f"evaluation.alignment={alignment}")
+    prior = SimpleNamespace(provenance=SimpleNamespace(settings={"structure": {"scale": "arbitrary"}}))
+    run, dense = scene.run(), transform_cloud(scene.cloud, scene.ours.inverse())
+    unknown = score_map(run, dense, dense, None, dataclasses.replace(scene.scorer(), prior=prior))
+    known = score_map(run, dense, dense, None, scene.scorer())
+    if alignment == "sim3":
+        rigid = {key for key in known if key.startswith("reconstruction_se3/")}
+        assert unknown["reconstruction_se3/reason"] == "the prior's unit is not the metre"
+        assert rigid and all(unknown[key] is None for key in rigid)
+        known = {key: value for key, value in known.items() if key not in rigid}
+    assert {key: unknown[key] for key in known} == known
+
+
 def test_what_an_alignment_by_poses_leaves_open_is_closed_by_the_points_but_for_the_scale():
     """The poses are turned by half a degree about the centre of the points, 3 cm at their ends, and 10 % too small."""
     scene = Scene()
