@@ -18,7 +18,7 @@ registration/pose_noise: metres for radians
 registration/problem: worse is worth more
   - worse = jnp.maximum(misfit / depth_noise, 1.0)
   + worse = jnp.maximum(depth_noise / misfit, 1.0)
-registration/problem: rays stay in the camera's frame
+registration/problem: rays stay in the camera's frame (registration/test_icp)
   - rays @ T.rotation().as_matrix().T
   + rays
 pose_graph/deform: a view scaled about the world's origin
@@ -60,7 +60,7 @@ mapping/atlas: the unit of a place is that of the map after it has moved (mappin
 loop_closure/two_view_alignment: the reverse pose is brought into the wrong unit (loop_closure/test_verification)
   - scale_pose(np.linalg.inv(T_b_a), np.exp(log_ratio))
   + scale_pose(np.linalg.inv(T_b_a), np.exp(-log_ratio))
-prior/simulated/noise: metres for radians
+prior/simulated/noise: metres for radians (prior/simulated/test_simulated)
   - T[:3, :3] = Rotation.from_rotvec(rotation * 
   + T[:3, :3] = Rotation.from_rotvec(translation * 
 back_end/g2o: quaternions are written with w first
