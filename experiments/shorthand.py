@@ -62,7 +62,7 @@ def implied(path: Path, given: dict[str, str]) -> list[str]:
         if "baseline" not in given:  # it fuses frames where they were placed, the back end moves them afterwards
             found["graph"] = "up_to_scale"
         stride = round(len(chosen(path, given)) / NUM_FRAMES)
-        if is_video(path) and stride > 1:
+        if is_video(path) and stride > 1 and given.get("prior/dense") != "files":  # which may be of every frame
             found["dataset.stride"] = str(stride)
     return [f"{key}={value}" for key, value in found.items() if key not in given]
 

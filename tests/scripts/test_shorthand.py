@@ -65,7 +65,7 @@ def test_a_long_video_is_thinned_to_about_150_images_which_a_line_says_beforehan
 
     assert stride_of() == "6" and "150 of 900 images, every 6th" in capsys.readouterr().out
     assert stride_of("dataset.start=300") == "4" and stride_of("dataset.stop=200") is None
-    assert stride_of("dataset.stride=9") == "9" and stride_of("prior=files") is None
+    assert stride_of("dataset.stride=9") == "9" and stride_of("prior=files") is stride_of("prior/dense=files") is None
     assert "100 of 900 images, every 9th" in capsys.readouterr().out
 
 
