@@ -24,7 +24,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from emgs_jax.config.configure import CONF, compose, first_of_sweep, message_of
 from emgs_jax.config.overrides import KEY, quoted, readable
-from emgs_jax.config.values import check_values
+from emgs_jax.config.values import check_keys
 from emgs_jax.device.settings import check_platforms, leave_memory_to_torch, use_compilation_cache
 from emgs_jax.io.files import check_writable, owned
 
@@ -52,7 +52,8 @@ def command(
                     logging.getLogger(library).setLevel(logging.WARNING)
             with kept_words(HydraConfig.get().job_logging), clear_errors(), nothing_left():
                 check_missing(name, config)
-                check_values(config, cls=KEYS.get(name))
+                if name in KEYS:
+                    check_keys(config, KEYS[name])
                 check_out(config)
                 leave_memory_to_torch(config)
                 check_platforms()

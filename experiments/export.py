@@ -6,7 +6,7 @@ from pathlib import Path
 from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import build_dataset
-from emgs_jax.config.values import check_values
+from emgs_jax.config.values import check_keys
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import check_writable, new_folder, owned
 from emgs_jax.ops.camera import Camera
@@ -19,7 +19,7 @@ from .command import command, first_words
 
 def export_run(config: DictConfig) -> list[Path]:
     """Write what the config names; returns the files and folders."""
-    check_values(config, cls=ExportConfig)
+    check_keys(config, ExportConfig)
     formats, length = list(dict.fromkeys(map(str, config.formats))), config.length and [float(n) for n in config.length]
     wanted = ExportConfig(formats, config.max_points, config.scale, length, str(config.images), str(config.moving))
     run = read_run(Path(str(config.folder)))

@@ -5,6 +5,7 @@ are keys of a run: `conf/graph/default.yaml` begins with `schema`, which is made
 """
 
 import dataclasses
+import importlib.util
 from collections.abc import Mapping
 from functools import cache
 from typing import Any
@@ -45,6 +46,7 @@ SCHEMAS = {
     "slam/observation/schema": "emgs_jax.observation.ObservationConfig",
     "slam/splitting/schema": "emgs_jax.splitting.SplittingConfig",
 }
+WITHOUT_JAX = ("masks", "features/files", "features/image", "prior/compute", "prior/masks")
 
 
 @cache
@@ -56,8 +58,21 @@ def register() -> None:
 
 
 def schema_of(name: str) -> dict[str, Any]:
-    """Return the node of a name in `SCHEMAS`."""
+    """Return the node of a name in `SCHEMAS`; without keys where its class needs JAX, and JAX is not installed.
+
+    Predictions are recorded where there may be none: nothing of such a class is used there.
+    """
+    if not has_jax() and name not in WITHOUT_JAX:
+        return {"_target_": SCHEMAS[name]}
     return node_of(get_class(SCHEMAS[name]))
+
+
+def has_jax() -> bool:
+    """Test whether JAX can be imported."""
+    try:
+        return importlib.util.find_spec("jax") is not None
+    except ValueError:  # it is kept out of this process
+        return False
 
 
 def node_of(cls: type, **given: Any) -> dict[str, Any]:

@@ -35,20 +35,21 @@ class Declared(NamedTuple):
         return {part for part in _parts(self.hint) if part in (int, float, *_NAMES)}
 
 
-def check_values(config: DictConfig, key: str = "", cls: type | None = None) -> None:
-    """Raise ValueError with the full key where a value at or below a node is not what is declared.
+def check_keys(config: DictConfig, cls: type) -> None:
+    """Raise ValueError with the key where a value of a config is not what the field of a class declares."""
+    for key, field in declared(cls).items():
+        if not OmegaConf.is_missing(config, key):
+            check_value(key, config[key], field)
 
-    Args:
-        key: dotted; empty: the whole config.
-        cls: class that declares the node's fields; None: the one that its `_target_` names, if any.
-    """
-    node = OmegaConf.select(config, key) if key else config
+
+def check_values(config: DictConfig, key: str) -> None:
+    """Raise ValueError with the full key where a value at or below a node with `_target_` is not what is declared."""
+    node = OmegaConf.select(config, key)
     if not isinstance(node, DictConfig):
         return
-    cls = get_class(node["_target_"]) if cls is None and "_target_" in node else cls
-    fields = {} if cls is None else declared(cls)
+    fields = declared(get_class(node["_target_"])) if "_target_" in node else {}
     for name in node:
-        own = f"{key}.{name}" if key else str(name)
+        own = f"{key}.{name}"
         if found := re.fullmatch(r"\$\{(\w[\w.]*)\}", str(OmegaConf.to_container(node, resolve=False)[name])):
             own = found[1]  # where the value stands that is only referred to
         value = MISSING if OmegaConf.is_missing(node, name) else node[name]

@@ -55,7 +55,7 @@ pytestmark = pytest.mark.slow
         (["slam.refinement.render.opacity=0.3"], r"near names: .*\brender\.opacity"),
         (["dataset=tum", "dataset.num_frames=3"], r"dataset\.num_frames is no key of the config"),
         (["prior.nothing=2"], r"near names: prior\.version, prior\.classes, prior\.confusion, prior\.feature_size"),
-        (["render=bright"], "render=bright is no option of render: there are default"),
+        (["view=bright"], "view=bright is no option of view: there are live, none"),
         (["slam=paper"], r"slam is chosen by its parts: slam/em=…, slam/existence=…, slam/extrapolation=…"),
         (["dataset=scannetpp"], "dataset=scannetpp is no option of dataset: there are apartment, bonn, colmap"),
         (["dataset=1.5"], "^dataset=1.5 is no option of dataset: there are apartment"),
@@ -130,9 +130,7 @@ def test_the_help_of_a_run_lists_exactly_the_choices_that_there_are(monkeypatch,
         for name, words in lines.items()
         if name in own
     }
-    for shared in ("checked", "matched", "monocular"):  # what ways to depth have in common
-        own["prior/dense"].remove(shared)
-    of_other_commands = {"densify_on", "experiment_on", "protocol", "suite"}
+    of_other_commands = {"densify_on", "experiment_on", "suite"}
     stages = {name for name in own if name.startswith("slam/")}
     assert listed == {name: own[name] for name in {*own} - of_other_commands - stages | {"slam/em"}}
     assert {*re.findall(r"slam/\w+", lines["slam/em"]), "slam/em"} == stages

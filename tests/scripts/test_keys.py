@@ -6,7 +6,7 @@ import pytest
 from omegaconf import OmegaConf
 
 from emgs_jax.config.configure import compose
-from emgs_jax.config.values import check_values
+from emgs_jax.config.values import check_keys
 from emgs_jax.report.export import ExportConfig
 from experiments.keys import KEYS
 
@@ -33,10 +33,10 @@ WRONG = {
 @pytest.mark.parametrize("name", sorted(ALL))
 def test_a_value_of_another_kind_is_named_with_its_key_and_what_conf_says_passes(name):
     config = compose(*NEEDED.get(name, []), name=name)
-    check_values(config, cls=ALL[name])
+    check_keys(config, ALL[name])
     for key, values in WRONG[name].items():
         for value in values:
             other = config.copy()
             OmegaConf.update(other, key, value)
             with pytest.raises(ValueError, match=rf"^{key} must be "):
-                check_values(other, cls=ALL[name])
+                check_keys(other, ALL[name])
