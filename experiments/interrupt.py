@@ -1,5 +1,6 @@
 """Ctrl-C, and the SIGTERM of a scheduler, end a command with one word after it has written what it has."""
 
+import _weakrefset
 import contextlib
 import gc
 import os
@@ -19,6 +20,7 @@ class Terminated(KeyboardInterrupt):
 RAISED = {signal.SIGTERM: Terminated, signal.SIGINT: KeyboardInterrupt}
 _delays: Counter[int] = Counter()
 AGAIN, MOST = 0.01, 100  # s, and how often
+_WEAK = weakref.__file__, _weakrefset.__file__  # whose dictionaries and sets take out what is gone
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
@@ -37,11 +39,15 @@ def _send(number: int) -> None:
 
 
 def _is_lost(frame: FrameType | None) -> bool:
-    """Test whether a frame is inside a callback of the garbage collector (JAX has one) or a finalizer."""
+    """Test whether a frame is in a callback of the garbage collector (JAX has one), a finalizer or a weak reference.
+
+    Python prints what is raised there, and goes on.
+    """
     callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
     callbacks.add(weakref.finalize.__call__.__code__)
     while frame is not None:
-        if frame.f_code in callbacks or frame.f_code.co_name == "__del__":
+        is_of_weakref = frame.f_code.co_filename in _WEAK and frame.f_code.co_name in ("remove", "_remove")
+        if frame.f_code in callbacks or frame.f_code.co_name == "__del__" or is_of_weakref:
             return True
         frame = frame.f_back
     return False

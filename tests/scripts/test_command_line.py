@@ -10,6 +10,7 @@ import signal
 import subprocess
 import sys
 import threading
+import weakref
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -329,6 +330,22 @@ def heard():
         signal.signal(signal.SIGINT, before)
 
 
+class Key:
+    """What a weak reference may be of."""
+
+
+class Iterating(set):
+    """In the place of the iterators over a weak dictionary, which it looks at as it takes a key out."""
+
+    def __init__(self, send) -> None:
+        super().__init__()
+        self._send = send
+
+    def __bool__(self) -> bool:
+        self._send()
+        return False
+
+
 def raises(code: int) -> None:
     raise SystemExit(code)
 
@@ -337,7 +354,7 @@ WORDS = {signal.SIGTERM: "terminated\n", signal.SIGINT: "interrupted\n"}
 
 
 @pytest.mark.parametrize("number", WORDS)
-@pytest.mark.parametrize("place", ["collector", "object", "program", "imports"])
+@pytest.mark.parametrize("place", ["collector", "object", "weak reference", "program", "imports"])
 def test_a_signal_ends_a_command_with_one_word_wherever_the_program_is(number, place, monkeypatch, capfd):
     """Python prints what is raised in a callback of the collector, as JAX has one, and the run went on to its end."""
     sent = []
@@ -361,6 +378,11 @@ def test_a_signal_ends_a_command_with_one_word_wherever_the_program_is(number, p
                     gc.collect()
             case "object":
                 Going(send)
+            case "weak reference":  # which a dictionary takes out; the key's last use is here
+                kept = weakref.WeakKeyDictionary()
+                kept._iterating = Iterating(send)
+                kept[key := Key()] = None
+                del key
             case "program":
                 send()
             case "imports":
