@@ -15,14 +15,14 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from emgs_jax.config.configure import build, build_dataset, build_prior, compose
+from emgs_jax.drawing.overview import fill_holes, paint_from_above
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.mapping.window_input import window_inputs
-from emgs_jax.report.finished_run import FinishedRun, read_run
-from emgs_jax.report.gathering import gather
-from emgs_jax.report.metrics import true_cloud
-from emgs_jax.report.overview import fill_holes, paint_from_above
-from emgs_jax.report.repeat import repeat
+from emgs_jax.runs.finished_run import FinishedRun, read_run
+from emgs_jax.runs.gathering import gather
+from emgs_jax.runs.metrics import true_cloud
+from emgs_jax.runs.repeat import repeat
 
 TARGET = Path(__file__).with_name("before_after.png")
 LOW, HIGH = 0.4, 1.7  # m above the floor: walls and furniture, no floor and no ceiling

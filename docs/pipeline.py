@@ -17,14 +17,14 @@ from PIL import Image
 
 from emgs_jax.config.configure import build, build_dataset, build_prior, compose
 from emgs_jax.device.arrays import to_se3
+from emgs_jax.drawing.layers import closed
+from emgs_jax.drawing.overview import fill_holes, paint_from_above
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.mapping.window_input import window_inputs
 from emgs_jax.render.composite import render
-from emgs_jax.report.finished_run import FinishedRun, read_run, render_config
-from emgs_jax.report.layers import closed
-from emgs_jax.report.overview import fill_holes, paint_from_above
-from emgs_jax.report.repeat import repeat
+from emgs_jax.runs.finished_run import FinishedRun, read_run, render_config
+from emgs_jax.runs.repeat import repeat
 
 TARGET, FRAME = Path(__file__).with_name("pipeline.jpg"), 20
 CELL, HIGH = 0.02, 1.7  # m

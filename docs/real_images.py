@@ -22,15 +22,15 @@ from scipy.spatial.transform import Rotation, RotationSpline
 
 from emgs_jax.config.configure import build, compose
 from emgs_jax.device.arrays import to_se3
+from emgs_jax.drawing.colors import to_bytes
+from emgs_jax.drawing.layers import closed
+from emgs_jax.drawing.splats import read_splats
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.splats import draw
 from emgs_jax.render.composite import render
-from emgs_jax.report.colors import to_bytes
-from emgs_jax.report.finished_run import SPLATS_FILE, read_run, render_config
-from emgs_jax.report.layers import closed
-from emgs_jax.report.splats import read_splats
+from emgs_jax.runs.finished_run import SPLATS_FILE, read_run, render_config
 
 TARGET = Path(__file__).with_name("real_images.jpg")
 NUM_STEPS = 60  # of the flight, there; as many back

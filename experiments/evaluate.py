@@ -25,10 +25,10 @@ from emgs_jax.config.values import check_values
 from emgs_jax.io.files import check_writable, write_file, write_json
 from emgs_jax.report.evaluation_page import Found, JobLine, write_evaluation_page
 from emgs_jax.report.gate import TOLERANCES, read_gate, regressions, rounding_tolerances, write_gate
-from emgs_jax.report.provenance import code_now, code_of
 from emgs_jax.report.published import published
-from emgs_jax.report.results import METRICS_FILE, is_finished, read_estimates, read_metrics, result_folder
 from emgs_jax.report.tables import Row, average, full_table, paper_table, to_csv
+from emgs_jax.runs.provenance import code_now, code_of
+from emgs_jax.runs.results import METRICS_FILE, is_finished, read_estimates, read_metrics, result_folder
 
 from .command import command, overrides_of
 from .run import run

@@ -10,9 +10,9 @@ from emgs_jax.config.values import check_keys
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import check_writable, new_folder, owned
 from emgs_jax.ops.camera import Camera
-from emgs_jax.report.export import IMAGE_FORMATS, ExportConfig, export, find_factor, write_scaled
-from emgs_jax.report.finished_run import FinishedRun, read_run
-from emgs_jax.report.run_images import images_of
+from emgs_jax.runs.export import IMAGE_FORMATS, ExportConfig, export, find_factor, write_scaled
+from emgs_jax.runs.finished_run import FinishedRun, read_run
+from emgs_jax.runs.images import images_of
 
 from .command import command, first_words
 

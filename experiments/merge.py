@@ -5,9 +5,11 @@ from typing import Any
 
 from omegaconf import DictConfig
 
-from emgs_jax.report.finished_run import REPORT_FILE
-from emgs_jax.report.merging import merge
+from emgs_jax.report.page import write_report
 from emgs_jax.report.printout import last_words, metrics_table
+from emgs_jax.runs.finished_run import REPORT_FILE, read_run
+from emgs_jax.runs.images import images_of
+from emgs_jax.runs.merging import merge
 
 from .command import command, first_words
 
@@ -21,7 +23,10 @@ def merge_runs(config: DictConfig) -> tuple[dict[str, Any], list[str]]:
         raise ValueError(f"a run is named twice in {', '.join(map(str, folders))}: give each once")
     if out.exists():
         raise ValueError(f"out={out} is there already: give a folder that is not")
-    return merge(folders, out, config.truth)
+    metrics, notes = merge(folders, out, config.truth)
+    merged = read_run(out)
+    write_report(merged, *images_of(merged))
+    return metrics, notes
 
 
 @command("merge", first_words("folders", is_list=True))

@@ -7,11 +7,11 @@ from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.config.configure import build
 from emgs_jax.io.files import check_writable, owned
-from emgs_jax.report.finished_run import SPLATS_FILE, read_run
 from emgs_jax.report.page import write_report
 from emgs_jax.report.printout import polish_lines
-from emgs_jax.report.run_images import images_of
-from emgs_jax.report.run_splats import polish
+from emgs_jax.runs.finished_run import SPLATS_FILE, read_run
+from emgs_jax.runs.images import images_of
+from emgs_jax.runs.polished import polish
 
 from .command import command, first_words
 

@@ -16,9 +16,6 @@ from emgs_jax.data.class_file import read_classes
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.io.files import check_writable
 from emgs_jax.io.trajectory import load_trajectory_tum
-from emgs_jax.report.finished_run import FinishedRun, read_run
-from emgs_jax.report.provenance import is_metric
-from emgs_jax.report.query import Question, ask, write_answer
 from emgs_jax.report.query_pictures import (
     FEATURES_PICTURE,
     LABELS_FOLDER,
@@ -31,7 +28,10 @@ from emgs_jax.report.query_pictures import (
     save_labels,
     views_of,
 )
-from emgs_jax.report.vocabulary import Vocabulary, feature_model, vocabulary, words_of
+from emgs_jax.runs.finished_run import FinishedRun, read_run
+from emgs_jax.runs.provenance import is_metric
+from emgs_jax.runs.query import Question, ask, write_answer
+from emgs_jax.runs.vocabulary import Vocabulary, feature_model, vocabulary, words_of
 
 from .command import command
 

@@ -6,11 +6,11 @@ from omegaconf import DictConfig
 
 from emgs_jax.io.files import check_writable
 from emgs_jax.report.columns import aligned
-from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.multirun import runs_of, write_multirun
 from emgs_jax.report.page import write_report
-from emgs_jax.report.results import METRICS_FILE
-from emgs_jax.report.run_images import images_of
+from emgs_jax.runs.finished_run import read_run
+from emgs_jax.runs.images import images_of
+from emgs_jax.runs.results import METRICS_FILE
 
 from .command import command, first_words
 

@@ -27,13 +27,15 @@ from emgs_jax.mapping.records import FrameRecord, show_records, to_line
 from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
-from emgs_jax.report.back_end import revisit_note
-from emgs_jax.report.dense import center_cloud, dense_map
-from emgs_jax.report.finished_run import REPORT_FILE, read_run
-from emgs_jax.report.gathering import Baselines, RawPrior, gather
-from emgs_jax.report.labelling import labelled_map
-from emgs_jax.report.live import LiveView, live_view
-from emgs_jax.report.metrics import (
+from emgs_jax.report.page import write_report
+from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words
+from emgs_jax.runs.back_end import revisit_note
+from emgs_jax.runs.dense import center_cloud, dense_map
+from emgs_jax.runs.files import claim_folder, save_classes, save_outputs, save_progress
+from emgs_jax.runs.finished_run import REPORT_FILE, read_run
+from emgs_jax.runs.gathering import Baselines, RawPrior, gather
+from emgs_jax.runs.labelling import labelled_map
+from emgs_jax.runs.metrics import (
     compared_text,
     describe,
     new_scorer,
@@ -43,11 +45,9 @@ from emgs_jax.report.metrics import (
     score_prior,
     spent,
 )
-from emgs_jax.report.page import write_report
-from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words
-from emgs_jax.report.provenance import is_metric, provenance, signature, write_metrics
-from emgs_jax.report.run_files import claim_folder, save_classes, save_outputs, save_progress
-from emgs_jax.report.run_splats import OPTAX, polish
+from emgs_jax.runs.polished import OPTAX, polish
+from emgs_jax.runs.provenance import is_metric, provenance, signature, write_metrics
+from emgs_jax.viewer.live import LiveView, live_view
 
 from .command import command
 from .shorthand import with_source

@@ -19,10 +19,10 @@ from emgs_jax.evaluation.trajectory import associate, check_conventions, traject
 from emgs_jax.io.ply_reader import num_faces
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.prior.base import Provenance
-from emgs_jax.report.metrics import true_cloud
-from emgs_jax.report.provenance import provenance, write_metrics
-from emgs_jax.report.results import METRICS_FILE, estimates_of, is_finished, result_folder
 from emgs_jax.report.tables import average, full_table
+from emgs_jax.runs.metrics import true_cloud
+from emgs_jax.runs.provenance import provenance, write_metrics
+from emgs_jax.runs.results import METRICS_FILE, estimates_of, is_finished, result_folder
 
 from .command import command
 

@@ -11,11 +11,11 @@ from omegaconf import DictConfig, ListConfig
 from emgs_jax.data.class_file import read_classes
 from emgs_jax.evaluation.segmentation import LabelledPoints, TrueLabels, read_labelled_mesh
 from emgs_jax.io.files import write_file, write_json
-from emgs_jax.report.finished_run import FinishedRun, read_run
 from emgs_jax.report.published import published
-from emgs_jax.report.run_images import images_of
 from emgs_jax.report.segmentation_table import PROTOCOL, Counting, Placement, SceneResult, score_scene, summary, table
-from emgs_jax.report.vocabulary import feature_model, vocabulary
+from emgs_jax.runs.finished_run import FinishedRun, read_run
+from emgs_jax.runs.images import images_of
+from emgs_jax.runs.vocabulary import feature_model, vocabulary
 
 from .command import command
 

@@ -4,9 +4,9 @@ from pathlib import Path
 
 from omegaconf import DictConfig
 
-from emgs_jax.report.finished_run import read_run
-from emgs_jax.report.viewer import Viewer
-from emgs_jax.report.viewer_scene import shown
+from emgs_jax.runs.finished_run import read_run
+from emgs_jax.viewer.scene import shown
+from emgs_jax.viewer.viewer import Viewer
 
 from .command import command, first_words
 

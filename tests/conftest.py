@@ -173,3 +173,14 @@ def num_maps() -> int:
             return sum(1 for _ in file)
     except OSError:
         return MAX_MAPS + 1
+
+
+@pytest.fixture(scope="session")
+def chromium():
+    """One browser for all pages: the files that use it are one xdist_group; `chromium.fresh()` is one of its own."""
+    from browser import MISSING, browser
+
+    if MISSING is not None:
+        pytest.skip(MISSING)
+    with browser() as one:
+        yield one

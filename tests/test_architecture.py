@@ -37,7 +37,10 @@ HOST = (
     "config",
     "sequence",
     "polish",
+    "drawing",
+    "runs",
     "report",
+    "viewer",
 )
 STAGES = {
     "initialization",

@@ -52,8 +52,8 @@ from emgs_jax.prior.base import windows
 from emgs_jax.prior.files.prior import Files
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.simulated.prior import Simulated
-from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.page import write_report
+from emgs_jax.runs.finished_run import read_run
 from tests.data.written_benchmarks import write_colmap, write_euroc, write_kitti, write_nerfstudio
 from tests.data.written_scene import (
     color_image,
@@ -63,7 +63,7 @@ from tests.data.written_scene import (
     write_seven_scenes,
     write_tum,
 )
-from tests.report.written_run import written_run
+from tests.written_run import written_run
 
 NUM_FRAMES, SIZE = 3, (48, 36)
 PINHOLE = (60.0, 60.0, 23.5, 17.5)

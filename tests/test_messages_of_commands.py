@@ -27,7 +27,7 @@ from emgs_jax.gaussian_map import new_map
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.loop_closure.place_recognition import Database, add_keyframe
-from emgs_jax.report.results import METRICS_FILE, is_finished
+from emgs_jax.runs.results import METRICS_FILE, is_finished
 from experiments.evaluate import plan
 from experiments.export import export_run
 from experiments.polish import polish_run
@@ -38,9 +38,9 @@ from experiments.view import view
 from tests.back_end.test_back_end import ring, walked
 from tests.messages import Step, check_messages, gone, moved, put
 from tests.report.test_segmentation_table import moved_run, write_truth
-from tests.report.written_run import written_run
 from tests.scripts.test_evaluate import made_up
 from tests.scripts.test_score import SIMILARITY, room, write_system
+from tests.written_run import written_run
 
 pytestmark = pytest.mark.slow
 

@@ -19,10 +19,10 @@ from emgs_jax.config.overrides import quoted
 from emgs_jax.device.settings import use_compilation_cache
 from emgs_jax.io.files import check_writable, write_file
 from emgs_jax.report.columns import Column, Line, markdown, metric_table
-from emgs_jax.report.provenance import git_now
-from emgs_jax.report.results import METRICS_FILE, Estimate, estimates_of, read_metrics
 from emgs_jax.report.tables import COLUMNS as ALL
 from emgs_jax.report.tables import average
+from emgs_jax.runs.provenance import git_now
+from emgs_jax.runs.results import METRICS_FILE, Estimate, estimates_of, read_metrics
 from experiments.evaluate import evaluate, plan
 
 CONFIG = Path(__file__).with_suffix(".yaml")

@@ -36,7 +36,7 @@ class DensifyConfig(eqx.Module):
         min_alpha: a pixel with less coverage has no depth.
         min_std: m; the floor of the covariances, which is not drawn along the surface, see `without_floor`.
         points: those of the `map` (the paper's rule), or the frames' `own` that the map does not contradict, see
-            `emgs_jax.report.dense.uncontradicted`.
+            `emgs_jax.runs.dense.uncontradicted`.
     """
 
     min_std: Float[Array, "*b"] = traced(low=0, high=1000)

@@ -1,1 +1,1 @@
-"""Reports for people: metrics, tables, pictures, gates, and the provenance of all of them."""
+"""Pages and tables of runs: report.html, results of many runs, numbers that papers print beside them, the gate."""

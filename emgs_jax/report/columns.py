@@ -8,8 +8,9 @@ import io
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
+from emgs_jax.runs.provenance import OWN_UNITS, ROWS
+
 DASH = "–"
-OWN_UNITS = ("colmap", "nerfstudio")  # data sets whose true poses are in a unit of their own
 
 
 class Column(NamedTuple):
@@ -148,3 +149,12 @@ def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
     writer.writeheader()
     writer.writerows(rows)
     return text.getvalue()
+
+
+def lines_of(metrics: Mapping[str, Any], columns: Sequence[Column]) -> list[Line]:
+    """Return a line for each estimate of `ROWS` that has one of these metrics."""
+    return [
+        Line([name], {column.key: metrics.get(prefix + column.key) for column in columns}, rivals=None)
+        for prefix, name in ROWS.items()
+        if any(prefix + column.key in metrics for column in columns)
+    ]

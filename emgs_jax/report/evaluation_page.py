@@ -7,11 +7,11 @@ from typing import Any, NamedTuple
 from markupsafe import Markup
 
 from emgs_jax.report.columns import MAIN, Cell, Line, Table, known, metric_table
-from emgs_jax.report.finished_run import REPORT_FILE
 from emgs_jax.report.html import MAX_LINES, Head, link, page, picture, thumbnails, write_page
-from emgs_jax.report.provenance import RAW_PRIOR, length_words
-from emgs_jax.report.results import METRICS_FILE, Estimate, read_metrics
 from emgs_jax.report.tables import COLUMNS, Row, over
+from emgs_jax.runs.finished_run import REPORT_FILE
+from emgs_jax.runs.provenance import RAW_PRIOR, length_words
+from emgs_jax.runs.results import METRICS_FILE, Estimate, read_metrics
 
 
 class JobLine(NamedTuple):

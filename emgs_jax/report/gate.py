@@ -10,8 +10,8 @@ from typing import Any
 import yaml
 
 from emgs_jax.io.files import atomic_write
-from emgs_jax.report.results import Estimate, sound
 from emgs_jax.report.tables import Row
+from emgs_jax.runs.results import Estimate, sound
 
 GATE_FORMAT = 1
 # By how much a metric of a new baseline may get worse, at least; which direction is better.

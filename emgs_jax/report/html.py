@@ -16,9 +16,9 @@ from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 from PIL import Image
 
+from emgs_jax.drawing.colors import STATUS_COLORS
 from emgs_jax.io.files import write_file
-from emgs_jax.report.colors import STATUS_COLORS
-from emgs_jax.report.finished_run import REPORT_FILE
+from emgs_jax.runs.finished_run import REPORT_FILE
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 MAX_BYTES = 5_000_000

@@ -8,7 +8,7 @@ from omegaconf import OmegaConf
 
 from emgs_jax.io.files import write_file
 from emgs_jax.report.columns import MAIN, Line, Table, csv_text, known, markdown, metric_table
-from emgs_jax.report.results import METRICS_FILE, read_metrics
+from emgs_jax.runs.results import METRICS_FILE, read_metrics
 
 OVERRIDES = Path(".hydra", "overrides.yaml")  # the words of a run, as Hydra keeps them
 

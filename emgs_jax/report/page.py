@@ -10,17 +10,18 @@ import numpy as np
 from markupsafe import Markup
 
 from emgs_jax.data.base import Dataset
+from emgs_jax.drawing.colors import NO_CLASS, PATHS, class_colors, rgb, to_bytes
+from emgs_jax.drawing.layers import COV_UNIT, feature_layer, fitted, layers_of, map_layers, packed, thinned
+from emgs_jax.drawing.overview import view_from_above
+from emgs_jax.drawing.splats import owners, read_splats, splats_for_page
 from emgs_jax.io.files import jsonable
 from emgs_jax.report import page_words
-from emgs_jax.report.colors import NO_CLASS, PATHS, class_colors, rgb, to_bytes
-from emgs_jax.report.finished_run import SPLATS_FILE, FinishedRun, PlacedPaths, placed_paths, render_config
 from emgs_jax.report.html import MAX_BYTES, POLICY, page, picture, source, thumbnails, write_page
-from emgs_jax.report.layers import COV_UNIT, feature_layer, fitted, layers_of, map_layers, packed, thinned
-from emgs_jax.report.overview import view_from_above
 from emgs_jax.report.page_pictures import Views, draw_views
 from emgs_jax.report.page_strip import key_of, strip
-from emgs_jax.report.repeat import repeat
-from emgs_jax.report.splats import owners, read_splats, splats_for_page
+from emgs_jax.runs.finished_run import SPLATS_FILE, FinishedRun, PlacedPaths, placed_paths, render_config
+from emgs_jax.runs.moving import frame_facts
+from emgs_jax.runs.repeat import repeat
 
 _MAP_BYTES = 2_800_000  # of base64; the rest is for pictures and words
 _SPLAT_BYTES = 2_400_000  # of these for the splats of emgs polish, where there are some
@@ -98,7 +99,7 @@ def _about(run: FinishedRun, layers: dict[str, np.ndarray]) -> dict[str, Any]:
             "title": [f"frame {line['index']}" for line in run.frames],
             "status": [line["status"] for line in run.frames],
             "reason": [str(line.get("reason") or "") for line in run.frames],
-            "facts": [page_words.frame_facts(line) for line in run.frames],
+            "facts": [frame_facts(line) for line in run.frames],
         },
         "loops": [[loop["frame"], loop["other"], loop["outcome"]] for loop in run.loops],
     }

@@ -12,15 +12,15 @@ from PIL import Image
 
 from emgs_jax.data.base import BadFrameError, Dataset
 from emgs_jax.device.arrays import fetched, to_se3
+from emgs_jax.drawing.colors import to_bytes
+from emgs_jax.drawing.layers import closed
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
-from emgs_jax.report.colors import to_bytes
-from emgs_jax.report.finished_run import FinishedRun
 from emgs_jax.report.html import jpeg
-from emgs_jax.report.layers import closed
-from emgs_jax.report.moving import with_moving
+from emgs_jax.runs.finished_run import FinishedRun
+from emgs_jax.runs.moving import with_moving
 
 WIDTH = 200  # pixels; a picture is not wider
 _NO_DEPTH = (221, 221, 221)

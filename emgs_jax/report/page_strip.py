@@ -5,10 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emgs_jax.report.colors import PATHS, STATUS_COLORS
-from emgs_jax.report.finished_run import FinishedRun
+from emgs_jax.drawing.colors import PATHS, STATUS_COLORS
 from emgs_jax.report.page_words import loop_words
-from emgs_jax.report.provenance import has_metric_truth
+from emgs_jax.runs.finished_run import FinishedRun
+from emgs_jax.runs.provenance import has_metric_truth
 
 HEIGHT = 100.0  # units of a row's picture; one unit across is a frame
 ERRORS = {"raw": "raw prior", "online": "as placed", "ours": "ours"}

@@ -2,7 +2,6 @@
 
 import json
 from collections import Counter
-from collections.abc import Mapping
 from typing import Any
 
 from emgs_jax.loop_closure.two_view_alignment import Gate
@@ -16,16 +15,16 @@ from emgs_jax.report.columns import (
     Line,
     Table,
     known,
+    lines_of,
     metric_table,
     transposed,
 )
-from emgs_jax.report.finished_run import POLISH, FinishedRun
 from emgs_jax.report.html import Head, commit_words
-from emgs_jax.report.moving import MUCH
 from emgs_jax.report.printout import polish_table
-from emgs_jax.report.provenance import RAW_PRIOR, length_words, lines_of
-from emgs_jax.report.repeat import Repeated
-from emgs_jax.report.results import sound
+from emgs_jax.runs.finished_run import POLISH, FinishedRun
+from emgs_jax.runs.provenance import RAW_PRIOR, length_words
+from emgs_jax.runs.repeat import Repeated
+from emgs_jax.runs.results import sound
 
 MANY_LOST = 0.1  # share of the frames
 MAX_LOOPS = 500  # that are named
@@ -185,18 +184,3 @@ def _plain(value: Any) -> str:
     if value is ...:
         return "not there"
     return ", ".join(map(str, value)) if isinstance(value, list) else "none" if value is None else str(value)
-
-
-def frame_facts(line: Mapping[str, Any]) -> str:
-    """Say the numbers of a frame in one line."""
-    known = {
-        "inliers": lambda v: f"{v:,} inliers",
-        "residual": lambda v: f"residual {100 * v:.1f} % of the depth",
-        "scale": lambda v: f"scale {v:.3f}",
-        "moving": lambda v: f"{100 * v:.0f} % moving" if v >= MUCH else "",
-        "new": lambda v: f"{v:,} new",
-        "num_gaussians": lambda v: f"{v:,} Gaussians",
-        "seconds": lambda v: f"{v:.2f} s",
-    }
-    found = [say(line[name]) for name, say in known.items() if isinstance(line.get(name), int | float)]
-    return " · ".join(filter(None, found))

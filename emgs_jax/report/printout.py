@@ -17,9 +17,8 @@ from emgs_jax.mapping.records import (
     main_reason,
 )
 from emgs_jax.ops.ranges import MAX_LENGTH_M
-from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Table, aligned, metric_table
-from emgs_jax.report.moving import MUCH
-from emgs_jax.report.provenance import lines_of
+from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Table, aligned, lines_of, metric_table
+from emgs_jax.runs.moving import MUCH
 
 MANY = 0.1  # share of frames
 POLISHED = (  # key of polish.json, words, digits

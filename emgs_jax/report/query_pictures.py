@@ -14,14 +14,14 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 
 from emgs_jax.device.arrays import to_se3
+from emgs_jax.drawing.colors import class_colors, save_figure, save_png
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.io.files import write_file
 from emgs_jax.ops.camera import Camera, downscale
 from emgs_jax.render.composite import RenderConfig, render
-from emgs_jax.report.colors import class_colors, save_figure, save_png
-from emgs_jax.report.finished_run import FinishedRun, render_config
-from emgs_jax.report.query import GREY, Answer, heat, hot, painted
+from emgs_jax.runs.finished_run import FinishedRun, render_config
+from emgs_jax.runs.query import GREY, Answer, heat, hot, painted
 from emgs_jax.semantics import principal_colors
 
 QUERY_PICTURE, FEATURES_PICTURE = "query.png", "features.png"

@@ -19,7 +19,7 @@ from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.geometry import Sim3
 from emgs_jax.report.columns import DASH, MAIN, Table, cell, in_unit, markdown
-from emgs_jax.report.finished_run import FinishedRun
+from emgs_jax.runs.finished_run import FinishedRun
 from emgs_jax.semantics import similarities
 
 FORMAT, VERSION = "emgs_jax.segmentation", 1

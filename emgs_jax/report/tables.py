@@ -19,7 +19,7 @@ from emgs_jax.report.columns import (
     markdown,
     metric_table,
 )
-from emgs_jax.report.results import Estimate
+from emgs_jax.runs.results import Estimate
 
 _PAPER_DATASETS = {"seven_scenes": "7-Scenes", "tum": "TUM"}
 _PAPER_COLUMNS = (  # title, key, digits; the order of the paper's Table II

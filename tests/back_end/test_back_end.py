@@ -46,9 +46,9 @@ from emgs_jax.motion import no_looks
 from emgs_jax.pose_graph.deform import DeformConfig
 from emgs_jax.pose_graph.factors import PoseGraph, residuals
 from emgs_jax.registration.pose_estimate import exact_estimate
-from emgs_jax.report import back_end as report
-from emgs_jax.report.back_end import counts, found_loops, loop_list, metric_graph, revisit_note
 from emgs_jax.report.page_words import loop_why
+from emgs_jax.runs import back_end as report
+from emgs_jax.runs.back_end import counts, found_loops, loop_list, metric_graph, revisit_note
 from emgs_jax.slam import SlamState
 
 COUNT, WINDOW = 60, 10

@@ -14,8 +14,8 @@ from emgs_jax.geometry import pose_difference
 from emgs_jax.localization import LEAST_NOISE
 from emgs_jax.mapping.checkpoint import CheckpointConfig, Keeper
 from emgs_jax.mapping.run import MappingRun
-from emgs_jax.report.metrics import score_back_end
-from emgs_jax.report.run_files import save_progress
+from emgs_jax.runs.files import save_progress
+from emgs_jax.runs.metrics import score_back_end
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("smoke")]
 MAX_DISTANCE, MAX_TURN = 0.05, 2.0  # the bar, where the prior errs; here it is exact

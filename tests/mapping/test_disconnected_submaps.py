@@ -20,8 +20,8 @@ from emgs_jax.mapping.atlas import join_factor
 from emgs_jax.mapping.checkpoint import CheckpointConfig, Keeper
 from emgs_jax.mapping.records import APART, UNJOINED
 from emgs_jax.mapping.run import MappingRun
-from emgs_jax.report.metrics import describe, score_back_end
-from emgs_jax.report.run_files import save_progress
+from emgs_jax.runs.files import save_progress
+from emgs_jax.runs.metrics import describe, score_back_end
 
 pytestmark = pytest.mark.xdist_group("smoke")
 

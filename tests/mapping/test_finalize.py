@@ -24,7 +24,7 @@ from emgs_jax.motion import no_looks
 from emgs_jax.observation import transform
 from emgs_jax.ops.camera import Camera
 from emgs_jax.registration.pose_estimate import exact_estimate
-from emgs_jax.report.run_files import save_progress
+from emgs_jax.runs.files import save_progress
 from emgs_jax.slam import SlamState, as_seen
 from tools.nees import pose_errors
 

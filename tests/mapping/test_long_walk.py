@@ -19,7 +19,7 @@ from emgs_jax.mapping.pipeline import finish_run, map_frames
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.prior.simulated.prior import Simulated
-from emgs_jax.report.metrics import STATUSES
+from emgs_jax.runs.metrics import STATUSES
 
 SIZE, PATH, SHORT, LONG = (64, 48), 40, 14, 1500
 # The map has room for the whole walk: where it is full it grows once, and another step is compiled.

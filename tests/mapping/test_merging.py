@@ -17,9 +17,9 @@ from emgs_jax.geometry import pose_difference
 from emgs_jax.mapping.atlas import Atlas
 from emgs_jax.mapping.merging import join
 from emgs_jax.prior.base import PriorPrediction
-from emgs_jax.report.finished_run import read_run
-from emgs_jax.report.merging import merge
-from emgs_jax.report.run_images import images_of
+from emgs_jax.runs.finished_run import read_run
+from emgs_jax.runs.images import images_of
+from emgs_jax.runs.merging import merge
 from experiments.merge import merge_runs
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("smoke")]

@@ -15,7 +15,7 @@ from emgs_jax.data.raycast import RayCast, Scene
 from emgs_jax.data.synthetic import build_room, camera_path
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.mapping.records import HIDDEN
-from emgs_jax.report.moving import moving_mask
+from emgs_jax.runs.moving import moving_mask
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("tiny")]
 

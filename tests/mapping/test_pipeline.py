@@ -22,10 +22,10 @@ from emgs_jax.mapping.run import clamped, new_run
 from emgs_jax.mapping.window_input import predictions, window_inputs
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import Prior
-from emgs_jax.report.dense import dense_map
-from emgs_jax.report.gathering import RawPrior
-from emgs_jax.report.metrics import new_scorer, score_map, score_prior
-from emgs_jax.report.run_files import save_outputs
+from emgs_jax.runs.dense import dense_map
+from emgs_jax.runs.files import save_outputs
+from emgs_jax.runs.gathering import RawPrior
+from emgs_jax.runs.metrics import new_scorer, score_map, score_prior
 
 pytestmark = pytest.mark.xdist_group("tiny")
 

@@ -24,9 +24,9 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.fit import Rates, Views, fit, is_held_out, place_on_splats, without_transparent
 from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, Shot, draw, gaussians_of, initial, loss, ssim
-from emgs_jax.report.finished_run import read_run
 from emgs_jax.report.printout import polish_lines
-from emgs_jax.report.run_splats import polish, target_of
+from emgs_jax.runs.finished_run import read_run
+from emgs_jax.runs.polished import polish, target_of
 from experiments.polish import polish_run
 from experiments.run import run
 

@@ -10,7 +10,7 @@ from written_run import written_run
 
 from emgs_jax.config.configure import build_dataset, build_prior, compose
 from emgs_jax.prior.base import windows
-from emgs_jax.report.results import read_estimates
+from emgs_jax.runs.results import read_estimates
 from experiments.command import check_arguments
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "extending.md"

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 
 from emgs_jax.report.gate import read_gate, regressions, rounding_tolerances, write_gate
-from emgs_jax.report.results import Estimate
 from emgs_jax.report.tables import Row
+from emgs_jax.runs.results import Estimate
 
 ATE, F1 = "trajectory/ate_sim3_m", "reconstruction/f1_20cm_percent"
 TOLERANCES = {ATE: {"direction": "lower", "tolerance": 0.01}, F1: {"direction": "higher", "tolerance": 1.0}}

@@ -14,18 +14,18 @@ from page_elements import HOSTILE, Elements
 from written_run import CLASSES, two_walls, written_run
 
 from emgs_jax.config.configure import groups
+from emgs_jax.drawing.layers import COV_UNIT, closing_covariances, fitted, packed, thinned
+from emgs_jax.drawing.splats import read_splats, splats_for_page
 from emgs_jax.features.text import TextEmbeddings, save_text
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.report.evaluation_page import run_facts
-from emgs_jax.report.finished_run import placed_paths, read_run
 from emgs_jax.report.html import DATA_LICENCES
-from emgs_jax.report.layers import COV_UNIT, closing_covariances, fitted, packed, thinned
 from emgs_jax.report.page import write_report
 from emgs_jax.report.page_strip import strip
 from emgs_jax.report.page_words import errors, verdict
 from emgs_jax.report.printout import metrics_table
-from emgs_jax.report.provenance import is_metric
-from emgs_jax.report.splats import read_splats, splats_for_page
+from emgs_jax.runs.finished_run import placed_paths, read_run
+from emgs_jax.runs.provenance import is_metric
 from experiments.report import report
 
 pytestmark = pytest.mark.slow

@@ -14,14 +14,14 @@ from test_sample_page import SAMPLE
 from written_run import INTRINSICS, SIZE, two_walls, written_run
 
 from emgs_jax.device.arrays import to_se3
+from emgs_jax.drawing.layers import closing_covariances
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.io.ply import save_gaussians_ply
 from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.splats import draw
 from emgs_jax.render.composite import render
-from emgs_jax.report.finished_run import read_run, render_config
-from emgs_jax.report.layers import closing_covariances
 from emgs_jax.report.page import write_report
+from emgs_jax.runs.finished_run import read_run, render_config
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
 

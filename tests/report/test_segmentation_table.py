@@ -15,7 +15,7 @@ from emgs_jax.io.ply import structured, write_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, to_tum
 from emgs_jax.report.segmentation_table import Counting
 from experiments.segment import segment
-from tests.report.written_run import written_run
+from tests.written_run import written_run
 
 pytestmark = pytest.mark.slow
 

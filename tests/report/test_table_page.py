@@ -18,8 +18,8 @@ from emgs_jax.io.files import write_json
 from emgs_jax.report import html
 from emgs_jax.report.evaluation_page import Found, JobLine, verdict, write_evaluation_page
 from emgs_jax.report.html import thumbnails
-from emgs_jax.report.results import estimates_of
 from emgs_jax.report.tables import average
+from emgs_jax.runs.results import estimates_of
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("browser")]
 

@@ -19,8 +19,8 @@ from tiny_run import CONF, TINY
 import experiments.evaluate
 from emgs_jax.config.configure import compose, groups
 from emgs_jax.report.gate import TOLERANCES, read_gate
-from emgs_jax.report.provenance import RESULT_FORMAT, git_now, write_metrics
-from emgs_jax.report.results import METRICS_FILE
+from emgs_jax.runs.provenance import RESULT_FORMAT, git_now, write_metrics
+from emgs_jax.runs.results import METRICS_FILE
 from experiments.command import clear_errors
 
 pytestmark = pytest.mark.slow

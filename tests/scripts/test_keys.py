@@ -7,7 +7,7 @@ from omegaconf import OmegaConf
 
 from emgs_jax.config.configure import compose
 from emgs_jax.config.values import check_keys
-from emgs_jax.report.export import ExportConfig
+from emgs_jax.runs.export import ExportConfig
 from experiments.keys import KEYS
 
 ALL = KEYS | {"export": ExportConfig}

@@ -12,7 +12,7 @@ from tiny_run import dataset
 from emgs_jax.config import configure
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.io.files import owned
-from emgs_jax.report.run_files import claim_folder
+from emgs_jax.runs.files import claim_folder
 from experiments.export import export_run
 from experiments.polish import polish_run
 from experiments.query import query

@@ -12,8 +12,8 @@ from emgs_jax.evaluation.reconstruction import ground_truth_cloud
 from emgs_jax.geometry import Sim3
 from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
-from emgs_jax.report.results import read_estimates
 from emgs_jax.report.tables import average, full_table
+from emgs_jax.runs.results import read_estimates
 from experiments.score import coverage, score
 
 pytestmark = pytest.mark.slow

@@ -11,8 +11,8 @@ from tiny_run import CONF
 import experiments.evaluate
 import tools.tables
 from emgs_jax.io.files import write_json
-from emgs_jax.report.provenance import RAW_PRIOR, RESULT_FORMAT, prefixed
-from emgs_jax.report.results import METRICS_FILE
+from emgs_jax.runs.provenance import RAW_PRIOR, RESULT_FORMAT, prefixed
+from emgs_jax.runs.results import METRICS_FILE
 from tools.tables import COLUMNS, CONFIG, SHORT, block, evaluations, short_block, tables, with_blocks
 
 PAGE = "before\n<!-- table: some -->\nold\n<!-- end -->\nbetween\n<!-- table: other -->\n<!-- end -->\nafter\n"

@@ -1,0 +1,1 @@
+"""What pictures, pages and viewers draw with: colours, layers of a map, splats, the overview."""

@@ -1,0 +1,1 @@
+"""Runs on disk: their files written, read, merged, exported, polished and asked for words."""

@@ -1,0 +1,41 @@
+"""The images of finished runs, by the settings in their metrics.json."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from omegaconf import OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from emgs_jax.config.configure import build_dataset, message_of
+from emgs_jax.data.joined import JoinedFrames
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.runs.finished_run import FinishedRun, read_run
+from emgs_jax.runs.repeat import check_targets
+
+
+def images_of(run: FinishedRun) -> tuple[ReadableFrames | None, str]:
+    """The data set of a run, or why there is none; raises ValueError where settings name other code than ours."""
+    settings, count = run.provenance["config"], len(run.poses)
+    check_targets(settings["dataset"])
+    try:
+        dataset = build_dataset(OmegaConf.create(dict(settings)))
+    except OmegaConfBaseException as error:  # a key of ours that the settings of older code do not have
+        return None, f"The images are not shown: the run is of another version ({str(error).splitlines()[0]})."
+    except (ValueError, OSError) as error:
+        return None, f"The images are not shown: {message_of(error)}"
+    if len(dataset) != count:
+        return None, f"The images are not shown: there are {len(dataset)} now, and {count} were mapped."
+    if dataset.fingerprint() != run.provenance["data"]["fingerprint"]:
+        return None, "The images are not shown: they are not those that were mapped."
+    return dataset, ""
+
+
+class ImagesOfRuns(JoinedFrames):
+    """The images of the runs in some folders, one after the other; ValueError where those of a run are gone."""
+
+    def __init__(self, runs: Sequence[str], has_truth: bool = True) -> None:
+        found = [images_of(read_run(Path(folder))) for folder in runs]
+        for folder, (dataset, note) in zip(runs, found, strict=True):
+            if dataset is None:
+                raise ValueError(f"{folder}: {note}")
+        super().__init__([dataset for dataset, _ in found], has_truth)

@@ -1,0 +1,211 @@
+"""Finished runs become one: their folders are read, their maps joined, and the files of one run are written."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, fields, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from omegaconf import DictConfig, OmegaConf
+
+from emgs_jax.back_end.saved_map import PLACES_FILE, SavedMap, load_places
+from emgs_jax.back_end.state import BackEnd, Node
+from emgs_jax.config.configure import CONF, build, build_dataset, compose, graph_config, message_of
+from emgs_jax.data.joined import common_camera, joined_name
+from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.features.text import save_text
+from emgs_jax.io.files import FrameLog, new_folder
+from emgs_jax.io.trajectory import from_tum
+from emgs_jax.mapping.atlas import Atlas, set_unjoined_apart, unvisited
+from emgs_jax.mapping.integrate import finish_back_end
+from emgs_jax.mapping.merging import beside, join, motion, with_lost
+from emgs_jax.mapping.records import FrameRecord, to_line, with_moved_nodes, with_unjoined_apart
+from emgs_jax.mapping.run import MappingRun
+from emgs_jax.ops.camera import Camera
+from emgs_jax.runs.dense import DenseMap, center_cloud, dense_map
+from emgs_jax.runs.files import save_outputs, save_progress
+from emgs_jax.runs.finished_run import FRAMES_FILE, TEXT_FILE, FinishedRun, read_run
+from emgs_jax.runs.metrics import Scorer, describe, score_back_end, score_map, true_cloud
+from emgs_jax.runs.provenance import git_now, write_metrics
+from emgs_jax.runs.repeat import repeat
+from emgs_jax.runs.results import METRICS_FILE
+
+OF_DATA = "name", "sequence"  # of a provenance's data
+
+
+@dataclass(frozen=True)
+class MergeableRun:
+    """A finished run as it is merged: with a node for each of its records."""
+
+    finished: FinishedRun
+    atlas: Atlas
+    records: tuple[FrameRecord, ...]
+
+
+def mergeable(folder: Path) -> MergeableRun:
+    """Read a finished run; raises ValueError where it has no keyframes by which its places are found."""
+    run = read_run(folder)
+    config = config_of(run)
+    slam, graph = build(config, "slam"), graph_config(config)
+    if graph is None or run.online is None or not (folder / PLACES_FILE).is_file():
+        raise ValueError(
+            f"{folder} has no keyframes of its own by which its places are found: map it again with graph=default"
+        )
+    end, depth_noise = load_places(folder / PLACES_FILE, BackEnd(graph, _camera_of(run)[1], float(slam.fit.min_std)))
+    records = tuple(record_of(line, pose) for line, pose in zip(run.frames, run.poses, strict=True))
+    end, lost = with_records(end, records, run.online)
+    slam = replace(slam, submap=replace(slam.submap, map_capacity=run.map.weight.shape[0]))
+    known = unvisited(SavedMap(run.map, end, depth_noise, is_frozen=False, checksum=""), run.camera, slam)
+    return MergeableRun(run, with_lost(Atlas(run.camera, slam, end, {0: known}), lost), records)
+
+
+def config_of(run: FinishedRun) -> DictConfig:
+    """The config of a run, with infinities, which metrics.json has not."""
+    return compose(*repeat(run.provenance["config"]).words)
+
+
+def record_of(line: Mapping[str, Any], pose: np.ndarray) -> FrameRecord:
+    """Read a record from its line of frames.jsonl; `pose` is that of the finished run."""
+
+    known = {field.name: line[field.name] for field in fields(FrameRecord) if field.name in line}
+    for name, value in known.items():
+        if name.endswith("pose") and value is not None:
+            known[name] = from_tum(np.array([value], np.float64))[0]
+    return FrameRecord(**known | {"pose": pose})
+
+
+def with_records(end: BackEnd, records: Sequence[FrameRecord], online: np.ndarray) -> tuple[BackEnd, Sequence[Node]]:
+    """Give the nodes what the records know; and make nodes of frames before the map began, which have none.
+
+    Args:
+        online: poses as first estimated, nan before the map began.
+    """
+    own = int(np.isfinite(online).all((1, 2)).sum())
+    lead, first = len(records) - own, len(end.nodes) - own
+    lost = [Node(record.pose, record.pose, 0.0, record.index, is_placed=False) for record in records[:lead]]
+
+    def told(node: Node, record: FrameRecord, pose: np.ndarray) -> Node:
+        covariance = None if record.covariance is None else np.array(record.covariance)
+        noise = record.depth_noise if record.status == "tracked" else None
+        return replace(node, online=pose, covariance=covariance, depth_noise=noise, origin=record.origin)
+
+    known = map(told, end.nodes[first:], records[lead:], online[lead:])
+    return replace(end, nodes=(*end.nodes[:first], *known), first_node=first), lost
+
+
+def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, list[int], dict[int, str]]:
+    """Join all runs with the first one, each where it shows places of it or of one that is joined already.
+
+    Returns the run of all, the order in which their frames are in it, and why a run of these was not joined. Without
+    `has_truth` the true poses are not in one world, and left out. ValueError where none can be joined with the first.
+    """
+    atlas, order, pending, reasons = runs[0].atlas, [0], [*range(1, len(runs))], {}
+    while pending:
+        for number in pending:
+            found = join(atlas, runs[number].atlas)
+            if isinstance(found, Atlas):
+                break
+            reasons[number] = found
+        else:
+            break
+        atlas, order = found, [*order, number]
+        pending.remove(number)
+        reasons.pop(number, None)
+    if len(order) == 1:
+        why = "; ".join(f"{runs[number].finished.folder}: {reason}" for number, reason in reasons.items())
+        raise ValueError(f"none can be joined with {runs[0].finished.folder}, so there is no merged run: {why}")
+    for number in pending:
+        atlas, order = beside(atlas, runs[number].atlas), [*order, number]
+    atlas = set_unjoined_apart(atlas, kept=0)
+    records = enumerate(record for number in order for record in runs[number].records)
+    records = [replace(one, index=row, true_pose=one.true_pose if has_truth else None) for row, one in records]
+    records = with_unjoined_apart(records, atlas.graph.nodes, kept=0)
+    atlas = numbered(finish_back_end(atlas))
+    records = with_moved_nodes(records, (), atlas.graph.nodes)
+    return MappingRun(atlas, records=in_one_world(records, [runs[number] for number in order], atlas)), order, reasons
+
+
+def in_one_world(records: Sequence[FrameRecord], parts: Sequence[MergeableRun], atlas: Atlas) -> list[FrameRecord]:
+    """Write what the records say of other poses and nodes in the world and the numbers of the merged run.
+
+    The first frame of each run that is in its map was placed where the raw prior says, so both move alike.
+    """
+    found, nodes = [], atlas.graph.nodes[atlas.graph.first_node :]
+    for part in parts:
+        before, begin = part.atlas.graph.nodes[part.atlas.graph.first_node :], len(found)
+        first = next((row for row, node in enumerate(before) if node.is_placed), 0)
+        similarity = motion(before[first], nodes[begin + first])
+        for record, node in zip(records[begin : begin + len(before)], nodes[begin:], strict=False):
+            poses = {name: getattr(record, name) for name in ("raw_pose", "newest_pose")}
+            moved = {name: pose if pose is None else similarity.apply_to_poses(pose) for name, pose in poses.items()}
+            found.append(replace(record, origin=node.origin, **moved))
+    return found
+
+
+def numbered(atlas: Atlas) -> Atlas:
+    """Give the nodes of all records the numbers of the frames of the merged run."""
+    first = atlas.graph.first_node
+    nodes = tuple(
+        replace(node, frame=row - first) if row >= first else node for row, node in enumerate(atlas.graph.nodes)
+    )
+    return replace(atlas, graph=replace(atlas.graph, nodes=nodes))
+
+
+def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[dict[str, Any], list[str]]:
+    """Write a merged run into a new folder, with unit and world of the first run.
+
+    Returns its metrics; and what there is to say: which run was not joined and why, and what could not be made.
+    """
+    read = [mergeable(folder) for folder in folders]
+    run, order, reasons = merged(read, has_truth)
+    parts = [read[number].finished for number in order]
+    origin, dataset, note = _origin(parts, has_truth)
+    config = config_of(parts[0])
+    densify, evaluation = replace(build(config, "densify"), points="map"), build(config, "evaluation")
+    (width, height), (fx, fy, cx, cy) = origin["data"]["frames"].values()
+    run = replace(run, atlas=replace(run.atlas, camera=Camera((fx, fy), (cx, cy), width, height)))
+    with new_folder(out) as new:
+        with FrameLog(new / FRAMES_FILE) as log:
+            for record in run.records:
+                log.append(to_line(record))
+        save_progress(new, run)
+        if dataset is None:
+            metrics, dense = {}, DenseMap(center_cloud(run))
+        else:
+            dense = dense_map(run, dataset, densify, evaluation)
+            scorer = Scorer(dataset, evaluation, true_cloud(dataset, evaluation), None, None)
+            metrics = score_map(run, dense.cloud, center_cloud(run), None, scorer) | dense.rendering
+        title, unit = f"{len(order) - len(reasons)} runs merged", "m" if parts[0].is_metric else "units"
+        notes = save_outputs(new, run, dense, densify, title, evaluation.alignment == "sim3", unit)
+        if parts[0].text is not None:
+            save_text(new / TEXT_FILE, parts[0].text)
+        metrics |= describe(run) | score_back_end(run) | {"provenance": origin}
+        write_metrics(new / METRICS_FILE, metrics)
+    apart = [f"{read[n].finished.folder} is not joined, and in submaps/ as it is: {why}" for n, why in reasons.items()]
+    return metrics, [*apart, *notes, *filter(None, [note])]
+
+
+def _origin(parts: Sequence[FinishedRun], has_truth: bool) -> tuple[dict[str, Any], ReadableFrames | None, str]:
+    """Provenance of a merged run, its images, and why there are none."""
+    first = parts[0].provenance
+    settings = OmegaConf.to_container(OmegaConf.create(dict(first["config"])), resolve=True)
+    images = {"_target_": OmegaConf.load(CONF / "merge.yaml").dataset["_target_"], "has_truth": has_truth}
+    images |= {"runs": [str(one.folder.resolve()) for one in parts]}
+    settings |= {"dataset": images, "map": None, "on_bad_frame": "error"}
+    settings["densify"] |= {"points": "map"}  # those of the frames are not kept
+    settings["masks"] |= {"folder": None}  # each run has its own
+    try:
+        dataset, note = build_dataset(OmegaConf.create(settings)), ""
+    except (ValueError, OSError) as error:
+        dataset, note = None, f"colours are those of the Gaussians, for images are gone: {message_of(error)}"
+    data = {key: joined_name(one.provenance["data"][key] for one in parts) for key in OF_DATA}
+    size, intrinsics = common_camera([_camera_of(one) for one in parts])
+    data |= {"fingerprint": dataset and dataset.fingerprint(), "camera": {}}
+    origin = {"config": settings, "git": git_now(), "simulated": any(one.provenance["simulated"] for one in parts)}
+    return first | origin | {"data": data | {"frames": {"size": size, "intrinsics": intrinsics}}}, dataset, note
+
+
+def _camera_of(run: FinishedRun) -> tuple[tuple[int, int], tuple[float, float, float, float]]:
+    """Size and intrinsics of a run's images, to the last digit."""
+    known = run.provenance["data"]["frames"]
+    return tuple(known["size"]), tuple(known["intrinsics"])

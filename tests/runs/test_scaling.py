@@ -1,0 +1,163 @@
+"""A run in another unit; oracles: a pinhole sees the same picture; bytes that must stay."""
+
+import json
+import math
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hand_run import random_poses
+from omegaconf import OmegaConf
+from written_run import written_run
+
+from emgs_jax import load_map
+from emgs_jax.config import configure
+from emgs_jax.io.mesh import save_mesh_ply
+from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
+from emgs_jax.io.ply_reader import read_vertices, scale_ply
+from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
+from emgs_jax.runs.export import factor_of, write_scaled
+from emgs_jax.runs.finished_run import read_run
+from experiments.export import export_run
+
+pytestmark = pytest.mark.slow
+
+
+FACTOR = 1.7
+
+
+@pytest.fixture
+def run(tmp_path):
+    rng = np.random.default_rng(3)
+    folder = written_run(tmp_path / "run")
+    run = read_run(folder)
+    poses = random_poses(rng, len(run.poses))
+    times, _ = load_trajectory_tum(folder / "trajectory.txt")
+    save_trajectory_tum(folder / "trajectory.txt", times, poses)
+    points = rng.normal(size=(300, 3)).astype(np.float32)
+    save_points_ply(folder / "points.ply", points, points, np.full((300, 3), 0.5), np.ones(300, int), ("wall", "sofa"))
+    save_gaussians_ply(
+        folder / "map.ply", points[:20], np.tile(np.diag([0.04, 0.01, 0.0025]), (20, 1, 1)), points[:20], 0.9
+    )
+    return read_run(folder)
+
+
+@cache
+def composed():
+    return configure.compose("folder=nowhere", name="export")
+
+
+def exported(run, **values):
+    return export_run(OmegaConf.merge(composed(), {"folder": str(run.folder), **values}))
+
+
+def test_poses_map_and_clouds_grow_together_and_everything_else_stays(run, tmp_path):
+    folder = tmp_path / "new"
+    folder.mkdir()
+    scaled = write_scaled(run, folder, FACTOR)
+    times, poses = load_trajectory_tum(folder / "trajectory.txt")
+    np.testing.assert_array_equal(times, load_trajectory_tum(run.folder / "trajectory.txt")[0])
+    np.testing.assert_allclose(poses[:, :3, 3], FACTOR * run.poses[:, :3, 3], atol=1e-8)
+    np.testing.assert_allclose(poses[:, :3, :3], run.poses[:, :3, :3], atol=1e-8)
+    np.testing.assert_array_equal(scaled.poses[:, 3], run.poses[:, 3])
+    map, valid = load_map(folder / "map.npz"), np.asarray(run.map.gaussians.valid)
+    np.testing.assert_allclose(map.gaussians.means, FACTOR * run.map.gaussians.means, rtol=1e-6)
+    np.testing.assert_allclose(map.gaussians.covs[valid], FACTOR**2 * run.map.gaussians.covs[valid], rtol=1e-6)
+    for name in ("colors", "normals", "features", "valid"):
+        np.testing.assert_array_equal(getattr(map.gaussians, name), getattr(run.map.gaussians, name))
+    online = [load_trajectory_tum(at / "trajectory_online.txt")[1] for at in (run.folder, folder)]
+    np.testing.assert_allclose(online[1][:, :3, 3], FACTOR * online[0][:, :3, 3], atol=1e-8)
+
+    # A scale shows in no image: pixels of all points from all cameras are the same.
+    def pixels(at):
+        cloud, (_, poses) = read_vertices(at / "points.ply"), load_trajectory_tum(at / "trajectory.txt")
+        points = np.stack([cloud[name] for name in "xyz"], 1).astype(float)
+        local = np.einsum("nji,npj->npi", poses[:, :3, :3], points - poses[:, None, :3, 3])
+        return local[..., :2] / local[..., 2:], local[..., 2] > 0.1
+
+    (before, seen), (after, _) = pixels(run.folder), pixels(folder)
+    np.testing.assert_allclose(after[seen], before[seen], atol=1e-5)
+
+
+def test_a_ply_keeps_labels_comments_and_triangles(run, tmp_path):
+    before, target = run.folder / "points.ply", tmp_path / "points.ply"
+    scale_ply(before, target, 2.0)
+    old, new = read_vertices(before), read_vertices(target)
+    for name in old:
+        np.testing.assert_array_equal(new[name], old[name] * (2 if name in "xyz" else 1), name)
+    head = before.read_bytes().split(b"end_header")[0]
+    assert b"comment label 1 sofa" in head and target.read_bytes().split(b"end_header")[0] == head
+    grid = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0), [0.0]), -1).reshape(-1, 3) / 20
+    assert (
+        save_mesh_ply(tmp_path / "m.ply", grid, np.tile([0.0, 0, 1], (400, 1)), (grid, np.full((400, 3), 0.5))) is None
+    )
+    scale_ply(tmp_path / "m.ply", tmp_path / "m2.ply", 2.0)
+    faces = [path.read_bytes()[-130:] for path in (tmp_path / "m.ply", tmp_path / "m2.ply")]
+    assert faces[0] == faces[1]
+
+
+def test_gaussians_of_a_ply_are_as_much_wider(run, tmp_path):
+    scale_ply(run.folder / "map.ply", tmp_path / "map.ply", FACTOR)
+    old, new = read_vertices(run.folder / "map.ply"), read_vertices(tmp_path / "map.ply")
+    widths = np.exp([new[f"scale_{i}"][0] for i in range(3)])
+    np.testing.assert_allclose(sorted(widths), FACTOR * np.array([0.05, 0.1, 0.2]), rtol=1e-5)
+    np.testing.assert_array_equal(new["opacity"], old["opacity"])
+
+
+def test_a_known_length_between_two_cameras_becomes_that_length(run):
+    factor = factor_of(run, [1, 5, 3.4])
+    a, b = run.poses[1][:3, 3], run.poses[5][:3, 3]
+    assert math.dist(factor * a, factor * b) == pytest.approx(3.4)
+    exported(run, length=[1, 5, 3.4], formats=["frustums"])
+    _, poses = load_trajectory_tum(run.folder / "scaled" / "trajectory.txt")
+    assert math.dist(poses[1][:3, 3], poses[5][:3, 3]) == pytest.approx(3.4, abs=1e-7)
+    assert json.loads((run.folder / "scaled" / "scale.json").read_text())["factor"] == pytest.approx(factor)
+    assert (run.folder / "scaled" / "cameras.ply").is_file()
+
+
+def test_exports_are_in_the_new_unit_and_the_run_stays(run):
+    before = {path.name: path.read_bytes() for path in run.folder.iterdir()}
+    exported(run, scale=FACTOR, formats=["nerfstudio"])
+    frames = json.loads((run.folder / "scaled" / "nerfstudio" / "transforms.json").read_text())["frames"]
+    centers = np.array([frame["transform_matrix"] for frame in frames])[:, :3, 3]
+    np.testing.assert_allclose(centers, FACTOR * np.delete(run.poses, 3, 0)[:, :3, 3], atol=1e-7)
+    cloud = read_vertices(run.folder / "scaled" / "nerfstudio" / "points.ply")
+    np.testing.assert_allclose(cloud["x"], FACTOR * read_vertices(run.folder / "points.ply")["x"], rtol=1e-6)
+    assert {name: (run.folder / name).read_bytes() for name in before} == before
+    with pytest.raises(ValueError, match="scaled is there already: remove it, or write elsewhere"):
+        exported(run, scale=2, formats=[])
+    exported(run, scale=2, formats=[], out=str(run.folder / "twice"))
+    assert not (run.folder / "twice" / "nerfstudio").exists()
+
+
+def test_a_failed_copy_leaves_nothing(run):
+    (run.folder / "points.ply").write_bytes((run.folder / "points.ply").read_bytes()[:-1])
+    with pytest.raises(ValueError, match="points.ply has .* bytes after its header"):
+        exported(run, scale=2, formats=[])
+    assert not [path for path in run.folder.iterdir() if "scaled" in path.name]
+
+
+@pytest.mark.parametrize(
+    ("values", "message"),
+    [
+        ({"length": [1, 5]}, r"length must be \[frame,frame,metres\]"),
+        ({"length": [1, 5, 0]}, r"length must be \[frame,frame,metres\]"),
+        ({"length": [1.5, 5, 2]}, r"length must be \[frame,frame,metres\]"),
+        ({"length": [1, 9, 2]}, "frame 9 is none of the run's"),
+        ({"length": [1, 3, 2]}, "frame 3 is lost, so its pose is a guess"),
+        ({"length": [1, 1, 2]}, "these two cameras are at one place"),
+        ({"scale": 0}, "scale must be .*, got 0"),
+        ({"scale": 2, "length": [1, 5, 2]}, "give one of them"),
+    ],
+)
+def test_a_length_or_scale_that_says_nothing_is_refused(run, values, message):
+    with pytest.raises(ValueError, match=message):
+        exported(run, **values)
+    assert not (run.folder / "scaled").exists()
+
+
+def test_frames_are_counted_as_frames_jsonl_counts_them(run):
+    """Where unreadable images were left out, rows and numbers differ."""
+    shifted = replace(run, frames=[{**frame, "index": frame["index"] + 10} for frame in run.frames])
+    assert factor_of(shifted, [11, 15, 2.0]) == factor_of(run, [1, 5, 2.0])
