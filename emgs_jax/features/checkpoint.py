@@ -14,17 +14,12 @@ BACKBONE = ("config.json", "model.safetensors")  # as Hugging Face publishes the
 
 @dataclass(frozen=True)
 class DinoFiles:
-    """Names within the folder of the checkpoint, beside the backbone's config.json and model.safetensors.
+    """Names within the folder of the checkpoint, beside the backbone's config.json and model.safetensors."""
 
-    Args:
-        vision_head: weights of dino.txt.
-        text_encoder: weights of dino.txt, perhaps the same file.
-        vocabulary: of CLIP.
-    """
-
-    vision_head: str = "dinov3_vitl16_dinotxt_vision_head_and_text_encoder-a442d8f5.pth"
+    vision_head: str = "dinov3_vitl16_dinotxt_vision_head_and_text_encoder-a442d8f5.pth"  # weights of dino.txt
+    # weights of dino.txt, perhaps the same file
     text_encoder: str = "dinov3_vitl16_dinotxt_vision_head_and_text_encoder-a442d8f5.pth"
-    vocabulary: str = "bpe_simple_vocab_16e6.txt.gz"
+    vocabulary: str = "bpe_simple_vocab_16e6.txt.gz"  # of CLIP
     source: str = "facebook/dinov3-vitl16-pretrain-lvd1689m on Hugging Face and facebookresearch/dinov3 on GitHub"
 
 

@@ -11,15 +11,11 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class ImageConfig:
-    """Preprocessing of images for the network: resizing and normalization.
+    """Preprocessing of images for the network: resizing and normalization."""
 
-    Args:
-        long_side: pixels to which the longer side is resized, a multiple of the patch.
-        mean: of RGB in [0, 1], subtracted.
-    """
-
+    # pixels to which the longer side is resized, a multiple of the patch
     long_side: int = number(640, low=1, high=65536)
-    mean: Sequence[float] = (0.485, 0.456, 0.406)
+    mean: Sequence[float] = (0.485, 0.456, 0.406)  # of RGB in [0, 1], subtracted
     std: Sequence[float] = (0.229, 0.224, 0.225)
 
 

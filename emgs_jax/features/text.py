@@ -20,16 +20,11 @@ REMEDY = "write it with `python -m experiments.embed`"
 
 @dataclass(frozen=True)
 class TextEmbeddings:
-    """Classes as vectors.
-
-    Args:
-        vectors: unit, float32 (classes, f).
-        templates: prompts over which each vector is the mean.
-    """
+    """Classes as vectors."""
 
     names: tuple[str, ...]
-    vectors: np.ndarray
-    templates: tuple[str, ...]
+    vectors: np.ndarray  # unit, float32 (classes, f)
+    templates: tuple[str, ...]  # prompts over which each vector is the mean
     model: dict
 
 

@@ -13,17 +13,11 @@ from emgs_jax.structure.model import Structure
 
 
 class Sources(NamedTuple):
-    """Other views.
+    """Other views."""
 
-    Args:
-        views: what of them is compared, such as grey images in [0, 1], features or depths (m, 0 = none); batched.
-        T_source_view: view -> source, batched likewise.
-        is_used: sources that count.
-    """
-
-    views: Any
-    T_source_view: jaxlie.SE3
-    is_used: Bool[Array, "s"]
+    views: Any  # what of them is compared, such as grey images in [0, 1], features or depths (m, 0 = none); batched
+    T_source_view: jaxlie.SE3  # view -> source, batched likewise
+    is_used: Bool[Array, "s"]  # sources that count
 
 
 def sources_of(found: Structure, frame: int, others: Sequence[int], count: int, view: Callable[[int], Any]) -> Sources:

@@ -16,48 +16,31 @@ from emgs_jax.structure.model import Structure
 
 @dataclass(frozen=True, kw_only=True)
 class DenseConfig:
-    """Settings of a view's dense depth: what is accepted.
+    """Settings of a view's dense depth: what is accepted."""
 
-    Args:
-        noise: standard deviation of a depth.
-        num_checks: views whose depth is compared with it.
-        depth_step: of the depths of two views, as a fraction: where they differ by so much they agree by 1/e.
-        depth_margin: a depth may lie beyond the landmarks' by this factor.
-    """
-
-    noise: DepthNoiseConfig
-    num_checks: int = number(4, low=0, high=64)
+    noise: DepthNoiseConfig  # standard deviation of a depth
+    num_checks: int = number(4, low=0, high=64)  # views whose depth is compared with it
+    # of the depths of two views, as a fraction: where they differ by so much they agree by 1/e
     depth_step: float = number(0.02, low=1e-6)
-    depth_margin: float = number(1.4, low=1, high=1000)
+    depth_margin: float = number(1.4, low=1, high=1000)  # a depth may lie beyond the landmarks' by this factor
 
 
 class Scene(NamedTuple):
-    """Frames with poses.
-
-    Args:
-        lenses: of the worlds of the structure.
-        camera: pinhole, of all frames.
-    """
+    """Frames with poses."""
 
     dataset: Dataset
     structure: Structure
-    lenses: list[Lens]
-    camera: Camera
+    lenses: list[Lens]  # of the worlds of the structure
+    camera: Camera  # pinhole, of all frames
 
 
 class Depth(NamedTuple):
-    """Depth of a view, at the pixels of the pinhole camera.
+    """Depth of a view, at the pixels of the pinhole camera."""
 
-    Args:
-        depth: (h, w) z in the unit of the structure, 0 where it is not known.
-        spread: (h, w) a multiple of the standard deviation of log z, as the way to it has it.
-        pixels: (h, w), see `pixels_per_log_depth`; 1 where nothing was matched, 0 where there is no telling.
-        scale_std: of the logarithm of a factor that all depths have in common; 0 where they are triangulated.
-    """
-
-    depth: np.ndarray
-    spread: np.ndarray
-    pixels: np.ndarray
+    depth: np.ndarray  # (h, w) z in the unit of the structure, 0 where it is not known
+    spread: np.ndarray  # (h, w) a multiple of the standard deviation of log z, as the way to it has it
+    pixels: np.ndarray  # (h, w), see `pixels_per_log_depth`; 1 where nothing was matched, 0 where there is no telling
+    # of the logarithm of a factor that all depths have in common; 0 where they are triangulated
     scale_std: float = 0.0
 
 
@@ -66,17 +49,13 @@ Depths = Callable[[int], Depth]  # of a frame that the structure has placed
 
 @dataclass(frozen=True)
 class Way:
-    """A way to dense depth.
+    """A way to dense depth."""
 
-    Args:
-        begin: the structure, whose unit it may have changed, and the depth of each frame.
-        check: raises ValueError where it does not fit a data set, before anything is computed.
-        contents: what its files hold, for provenance.
-    """
-
+    # the structure, whose unit it may have changed, and the depth of each frame
     begin: Callable[[Scene], tuple[Structure, Depths]]
+    # raises ValueError where it does not fit a data set, before anything is computed
     check: Callable[[Dataset], None] = lambda dataset: None
-    contents: Mapping[str, Any] = field(default_factory=dict)
+    contents: Mapping[str, Any] = field(default_factory=dict)  # what its files hold, for provenance
 
 
 def tried_depths(z: np.ndarray, margin: float) -> np.ndarray:

@@ -18,20 +18,16 @@ from emgs_jax.prior.sources import Sources
 
 
 class DepthConfig(eqx.Module):
-    """Matching, and what a depth must pass.
-
-    Args:
-        max_cost: of the best plane, before aggregation.
-        min_margin: by which the aggregated cost of any plane that is not next to the best must exceed the best's.
-        temperature: aggregated cost above the best's at which a plane is 1/e as plausible.
-        median_radius: half the side of the window whose median replaces a depth: removes speckle, keeps edges.
-    """
+    """Matching, and what a depth must pass."""
 
     sweep: SweepConfig = field(default_factory=SweepConfig)
     semi_global: SemiGlobalConfig = field(default_factory=SemiGlobalConfig)
-    max_cost: Float[Array, "*b"] = traced(0.4, low=0, high=math.inf)
+    max_cost: Float[Array, "*b"] = traced(0.4, low=0, high=math.inf)  # of the best plane, before aggregation
+    # by which the aggregated cost of any plane that is not next to the best must exceed the best's
     min_margin: Float[Array, "*b"] = traced(0.0, low=0)
+    # aggregated cost above the best's at which a plane is 1/e as plausible
     temperature: Float[Array, "*b"] = traced(0.05, low=1e-6)
+    # half the side of the window whose median replaces a depth: removes speckle, keeps edges
     median_radius: int = static(2, low=0, high=32)
 
 

@@ -31,28 +31,18 @@ KEYS = ("depth", "depths", "disparity", "disparities", "inverse_depth", "predict
 
 @dataclass(frozen=True, kw_only=True)
 class DepthFilesConfig(MonocularConfig):
-    """Depths in files.
+    """Depths in files."""
 
-    Args:
-        folder: of the files, or the one file of all frames.
-        depth_scale: units of a metre in 16-bit .png files of metric depths.
-    """
-
-    folder: str
-    depth_scale: float = number(1000.0, low=1e-3, high=1e6)
+    folder: str  # of the files, or the one file of all frames
+    depth_scale: float = number(1000.0, low=1e-3, high=1e6)  # units of a metre in 16-bit .png files of metric depths
 
 
 class DepthFiles(NamedTuple):
-    """What a folder holds.
-
-    Args:
-        names: of each frame's file without its suffix; numbers where one file has all.
-        read: values (gh, gw) of one, NaN where there are none.
-    """
+    """What a folder holds."""
 
     files: Sequence[Path]
-    names: Sequence[str]
-    read: Callable[[int], np.ndarray]
+    names: Sequence[str]  # of each frame's file without its suffix; numbers where one file has all
+    read: Callable[[int], np.ndarray]  # values (gh, gw) of one, NaN where there are none
 
 
 def way_of_files(config: DepthFilesConfig) -> Way:

@@ -18,19 +18,12 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class DepthNoiseConfig:
-    """Its parts, as numbers that `docs/measurements/depth_noise.md` tells the origin of, and what is too much.
+    """Its parts, as numbers that `docs/measurements/depth_noise.md` tells the origin of, and what is too much."""
 
-    Args:
-        pixel_std: pixels; of a match.
-        spread_std: where the spread of a cost curve is 1, see `Stereo`.
-        difference_std: where other views differ by as much as the depth itself.
-        max_std: of a depth that is predicted.
-    """
-
-    pixel_std: float = number(low=0)
-    spread_std: float = number(low=0)
-    difference_std: float = number(low=0)
-    max_std: float = number(low=0)
+    pixel_std: float = number(low=0)  # pixels; of a match
+    spread_std: float = number(low=0)  # where the spread of a cost curve is 1, see `Stereo`
+    difference_std: float = number(low=0)  # where other views differ by as much as the depth itself
+    max_std: float = number(low=0)  # of a depth that is predicted
 
 
 def relative_std(

@@ -28,47 +28,29 @@ MAX_SHIFT = 0.95  # at 1 all depths are alike
 
 @dataclass(frozen=True)
 class LandmarkFitConfig:
-    """What is assumed of scale, shift and errors before the landmarks are seen.
+    """What is assumed of scale, shift and errors before the landmarks are seen."""
 
-    Args:
-        std: of log y, the network's error.
-        step_std: of the log scale and of the shift, from a frame to the next.
-        shift_std: of the shift itself.
-        dof: degrees of freedom of Student's t.
-        weight: of these assumptions, in frames.
-        min_landmarks: of a frame that begins at a fit of its own, instead of its neighbours'.
-        min_correlation: of the ranks of v and y: below, the landmarks contradict the kind.
-        num_steps: of the iteration.
-    """
-
-    std: float = number(0.05, low=1e-4, high=10)
-    step_std: float = number(0.01, low=1e-6, high=10)
-    shift_std: float = number(1.0, low=1e-3, high=100)
-    dof: float = number(4.0, low=1, high=1000)
-    weight: float = number(3.0, low=0, high=1000)
+    std: float = number(0.05, low=1e-4, high=10)  # of log y, the network's error
+    step_std: float = number(0.01, low=1e-6, high=10)  # of the log scale and of the shift, from a frame to the next
+    shift_std: float = number(1.0, low=1e-3, high=100)  # of the shift itself
+    dof: float = number(4.0, low=1, high=1000)  # degrees of freedom of Student's t
+    weight: float = number(3.0, low=0, high=1000)  # of these assumptions, in frames
+    # of a frame that begins at a fit of its own, instead of its neighbours'
     min_landmarks: int = number(12, low=3, high=10000)
+    # of the ranks of v and y: below, the landmarks contradict the kind
     min_correlation: float = number(0.3, low=0, high=1)
-    num_steps: int = number(20, low=1, high=1000)
+    num_steps: int = number(20, low=1, high=1000)  # of the iteration
 
 
 class LandmarkFit(NamedTuple):
-    """Scale and shift of the frames of a sequence.
+    """Scale and shift of the frames of a sequence."""
 
-    Args:
-        is_inverse: y is 1/z.
-        base: slope a, intercept b and median m.
-        parameters: (n, 2) log scale s and shift c.
-        covariance: (n, 2, 2) theirs.
-        std: (n,) of log y beside a landmark.
-        step_std: of log scale and shift, from a frame to the next.
-    """
-
-    is_inverse: bool
-    base: tuple[float, float, float]
-    parameters: np.ndarray
-    covariance: np.ndarray
-    std: np.ndarray
-    step_std: np.ndarray
+    is_inverse: bool  # y is 1/z
+    base: tuple[float, float, float]  # slope a, intercept b and median m
+    parameters: np.ndarray  # (n, 2) log scale s and shift c
+    covariance: np.ndarray  # (n, 2, 2) theirs
+    std: np.ndarray  # (n,) of log y beside a landmark
+    step_std: np.ndarray  # of log scale and shift, from a frame to the next
 
 
 class _Sample(NamedTuple):

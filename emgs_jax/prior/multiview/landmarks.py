@@ -10,18 +10,12 @@ from emgs_jax.structure.model import Structure
 
 
 class Landmarks(NamedTuple):
-    """Landmarks that a frame shows.
+    """Landmarks that a frame shows."""
 
-    Args:
-        pixels: (k, 2) column and row.
-        depth: (k,) z in the unit of the structure.
-        std: (k,) of log z.
-        weight: (k,) 1 over the number of landmarks in the same cell of the image: errors of a network are alike there.
-    """
-
-    pixels: np.ndarray
-    depth: np.ndarray
-    std: np.ndarray
+    pixels: np.ndarray  # (k, 2) column and row
+    depth: np.ndarray  # (k,) z in the unit of the structure
+    std: np.ndarray  # (k,) of log z
+    # (k,) 1 over the number of landmarks in the same cell of the image: errors of a network are alike there
     weight: np.ndarray
 
 

@@ -27,18 +27,13 @@ jitted = cache(eqx.filter_jit)  # one for all priors of a process
 
 @dataclass(frozen=True, kw_only=True)
 class LearnedConfig(MatchedConfig):
-    """Depth by a network.
-
-    Args:
-        magnification: of the images that it is shown, then rounded to what it can take.
-        checkpoint: path of its weights.
-        sha256: of that file, in hexadecimal digits.
-    """
+    """Depth by a network."""
 
     network: IterMVSConfig = field(default_factory=IterMVSConfig)
+    # of the images that it is shown, then rounded to what it can take
     magnification: float = number(1.0, low=0.01, high=16)
-    checkpoint: str | None
-    sha256: str
+    checkpoint: str | None  # path of its weights
+    sha256: str  # of that file, in hexadecimal digits
 
 
 def grid_of(camera: Camera, magnification: float) -> Camera:

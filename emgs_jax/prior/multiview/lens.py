@@ -12,19 +12,13 @@ from emgs_jax.data.camera_models import project
 
 @dataclass(frozen=True)
 class Lens:
-    """A pinhole camera, and what of it the images show.
+    """A pinhole camera, and what of it the images show."""
 
-    Args:
-        focal: fx, fy of the pinhole camera in pixels.
-        center: cx, cy likewise.
-        shown: (h, w, 2) float32, the image's pixel that shows what each of the pinhole camera's sees; None: its own.
-        straight: (h, w, 2) float32, the inverse.
-    """
-
-    focal: np.ndarray
-    center: np.ndarray
+    focal: np.ndarray  # fx, fy of the pinhole camera in pixels
+    center: np.ndarray  # cx, cy likewise
+    # (h, w, 2) float32, the image's pixel that shows what each of the pinhole camera's sees; None: its own
     shown: np.ndarray | None = None
-    straight: np.ndarray | None = None
+    straight: np.ndarray | None = None  # (h, w, 2) float32, the inverse
 
 
 def lens_of(camera: Any, intrinsics: tuple[float, ...], size: tuple[int, int]) -> Lens:

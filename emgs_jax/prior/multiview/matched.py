@@ -24,28 +24,20 @@ NUM_KEPT = 64  # frames whose images or features are at hand
 
 @dataclass(frozen=True, kw_only=True)
 class MatchedConfig(DenseConfig):
-    """Depth by matching a view with its sources.
+    """Depth by matching a view with its sources."""
 
-    Args:
-        num_sources: views that it is matched against.
-        best_parallax_rad: between the rays of a landmark, beyond which more is no better.
-    """
-
-    num_sources: int = number(6, low=1, high=64)
+    num_sources: int = number(6, low=1, high=64)  # views that it is matched against
+    # between the rays of a landmark, beyond which more is no better
     best_parallax_rad: float = number(0.2, low=1e-6, high=4)
 
 
 class Stereo(NamedTuple):
-    """How a view is matched.
+    """How a view is matched."""
 
-    Args:
-        prepare: RGB image (h, w, 3), uint8, and its lens -> what is kept of the view.
-        estimate: what is kept of the view and of its sources, nearest and farthest depth that is tried (m), camera ->
-            depth (h, w) in metres, 0 where it is not known, and the spread of what its cost curve takes for plausible,
-            a multiple of the standard deviation of log z.
-    """
-
-    prepare: Callable[[np.ndarray, Lens], Any]
+    prepare: Callable[[np.ndarray, Lens], Any]  # RGB image (h, w, 3), uint8, and its lens -> what is kept of the view
+    # what is kept of the view and of its sources, nearest and farthest depth that is tried (m), camera -> depth (h, w)
+    # in metres, 0 where it is not known, and the spread of what its cost curve takes for plausible, a multiple of the
+    # standard deviation of log z
     estimate: Callable[[Any, Sources, Float[Array, "2"], Camera], tuple[np.ndarray, np.ndarray]]
 
 

@@ -18,24 +18,20 @@ from emgs_jax.structure.model import Structure, scaled
 
 @dataclass(frozen=True, kw_only=True)
 class MonocularConfig(DenseConfig):
-    """Depth that is brought to the scale of landmarks.
-
-    Args:
-        fit: scale and shift of each frame.
-        kind: `metric` depths in metres, which the structure takes over; depths `up_to_scale`; `affine` depths, up to a
-            scale and a shift; `affine_inverse` depths, likewise.
-        cell: side of the part of an image where a network's errors are alike, as a share of its longer side.
-        pixel_std: of a landmark, in pixels of the images that the structure was made of.
-    """
+    """Depth that is brought to the scale of landmarks."""
 
     # Nothing is matched; the spread is that of the landmark fit.
     noise: DepthNoiseConfig = field(
         default_factory=partial(DepthNoiseConfig, pixel_std=0.0, spread_std=1.0, difference_std=1.0, max_std=0.2)
     )
-    fit: LandmarkFitConfig = field(default_factory=LandmarkFitConfig)
+    fit: LandmarkFitConfig = field(default_factory=LandmarkFitConfig)  # scale and shift of each frame
+    # `metric` depths in metres, which the structure takes over; depths `up_to_scale`; `affine` depths, up to a scale
+    # and a shift; `affine_inverse` depths, likewise
     kind: str = one_of(*KINDS)
     depth_margin: float = number(2.0, low=1, high=1000)
+    # side of the part of an image where a network's errors are alike, as a share of its longer side
     cell: float = number(0.1, low=1e-3, high=1)
+    # of a landmark, in pixels of the images that the structure was made of
     pixel_std: float = number(1.0, low=1e-3, high=100)
 
 

@@ -22,18 +22,13 @@ jitted_predict = eqx.filter_jit(predict)
 
 @dataclass(frozen=True, kw_only=True)
 class MeterConfig(MonocularConfig):
-    """Depth by METER.
+    """Depth by METER."""
 
-    Args:
-        width, height: of the images that it is shown, in pixels; multiples of 64.
-        checkpoint: path of its weights.
-        sha256: of that file, in hexadecimal digits.
-    """
-
+    # width, height: of the images that it is shown, in pixels; multiples of 64
     width: int = number(256, low=64, high=4096)
     height: int = number(192, low=64, high=4096)
-    checkpoint: str | None
-    sha256: str
+    checkpoint: str | None  # path of its weights
+    sha256: str  # of that file, in hexadecimal digits
 
 
 def way_of_meter(config: MeterConfig) -> Way:

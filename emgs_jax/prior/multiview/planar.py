@@ -20,29 +20,18 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class PlanarConfig:
-    """Detection of blank regions of an image that become planes.
+    """Detection of blank regions of an image that become planes."""
 
-    Args:
-        max_contrast: grey value range, image in [0, 1], of the surroundings of a pixel that is blank.
-        radius: pixels; half the side of these surroundings.
-        min_area: pixels of a region.
-        max_spread: planes of the sweep; matches that are less certain support nothing.
-        min_matches: of a region.
-        tolerance: planes of the sweep; matches so near to a plane support it.
-        min_share: of a region's matches that must support its plane.
-        num_draws: planes through three matches that are tried.
-        correlation: pixels; errors of matches that are nearer to each other are the same.
-    """
-
+    # grey value range, image in [0, 1], of the surroundings of a pixel that is blank
     max_contrast: float = number(0.03, low=0, high=1)
-    radius: int = number(1, low=1, high=64)
-    min_area: int = number(400, low=1)
-    max_spread: float = number(1.2, low=0)
-    min_matches: int = number(50, low=3)
-    tolerance: float = number(1.0, low=0)
-    min_share: float = number(0.75, low=0, high=1)
-    num_draws: int = number(64, low=1, high=1e6)
-    correlation: float = number(5.0, low=0)
+    radius: int = number(1, low=1, high=64)  # pixels; half the side of these surroundings
+    min_area: int = number(400, low=1)  # pixels of a region
+    max_spread: float = number(1.2, low=0)  # planes of the sweep; matches that are less certain support nothing
+    min_matches: int = number(50, low=3)  # of a region
+    tolerance: float = number(1.0, low=0)  # planes of the sweep; matches so near to a plane support it
+    min_share: float = number(0.75, low=0, high=1)  # of a region's matches that must support its plane
+    num_draws: int = number(64, low=1, high=1e6)  # planes through three matches that are tried
+    correlation: float = number(5.0, low=0)  # pixels; errors of matches that are nearer to each other are the same
 
 
 def blank_regions(gray: Float[np.ndarray, "h w"], config: PlanarConfig) -> Iterator[Bool[np.ndarray, "h w"]]:

@@ -11,22 +11,16 @@ from emgs_jax.prior.sources import Sources
 
 
 class SweepConfig(eqx.Module):
-    """Planes and the matching cost.
+    """Planes and the matching cost."""
 
-    Args:
-        num_planes: inverse depths that are tried.
-        num_best: of the sources, how many confirm a plane: the others may not see the point.
-        census_radius: half the side of the window that is compared.
-        census_spacing: of which every `census_spacing`-th row and column is used.
-        census_margin: grey value difference, image in [0, 1], below which two pixels count as equal.
-        unseen_cost: of a plane that leads out of a source's image; a random match costs about .5.
-    """
-
-    num_planes: int = static(64, low=2, high=4096)
+    num_planes: int = static(64, low=2, high=4096)  # inverse depths that are tried
+    # of the sources, how many confirm a plane: the others may not see the point
     num_best: int = static(2, low=1, high=64)
-    census_radius: int = static(4, low=1, high=32)
-    census_spacing: int = static(2, low=1, high=32)
+    census_radius: int = static(4, low=1, high=32)  # half the side of the window that is compared
+    census_spacing: int = static(2, low=1, high=32)  # of which every `census_spacing`-th row and column is used
+    # grey value difference, image in [0, 1], below which two pixels count as equal
     census_margin: Float[Array, "*b"] = traced(0.01, low=0, high=1)
+    # of a plane that leads out of a source's image; a random match costs about .5
     unseen_cost: Float[Array, "*b"] = traced(0.5, low=0)
 
     def __check_init__(self) -> None:

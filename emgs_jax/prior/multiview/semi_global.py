@@ -9,16 +9,11 @@ from emgs_jax.ops.pytree import traced
 
 
 class SemiGlobalConfig(eqx.Module):
-    """Penalties, in units of the matching cost.
+    """Penalties, in units of the matching cost."""
 
-    Args:
-        small_step: for a change by one plane along a path.
-        large_step: for any larger change where the image is flat.
-        edge: grey value difference, image in [0, 1], that halves the penalty of a larger change.
-    """
-
-    small_step: Float[Array, "*b"] = traced(0.1, low=0)
-    large_step: Float[Array, "*b"] = traced(1.0, low=0)
+    small_step: Float[Array, "*b"] = traced(0.1, low=0)  # for a change by one plane along a path
+    large_step: Float[Array, "*b"] = traced(1.0, low=0)  # for any larger change where the image is flat
+    # grey value difference, image in [0, 1], that halves the penalty of a larger change
     edge: Float[Array, "*b"] = traced(0.03, low=1e-6)
 
 

@@ -27,19 +27,13 @@ class NoAnswerError(ValueError):
 
 @dataclass(frozen=True)
 class ComputeConfig:
-    """Settings for running a network: device, precision and memory.
+    """Settings for running a network: device, precision and memory."""
 
-    Args:
-        device: `cuda` or `cpu`; None = cuda where there is one.
-        amp: `bf16`, `fp16` or `float32` on a GPU. A CPU computes in float32.
-        memory_efficient: run the dense heads in parts.
-        minibatch_size: images in such a part; None = what fits into the free memory, on which the last bits of the
-            result then depend.
-    """
-
-    device: str | None = None
+    device: str | None = None  # `cuda` or `cpu`; None = cuda where there is one
+    # `bf16`, `fp16` or `float32` on a GPU. A CPU computes in float32.
     amp: str = one_of("bf16", "fp16", "float32", default="bf16")
-    memory_efficient: bool = True
+    memory_efficient: bool = True  # run the dense heads in parts
+    # images in such a part; None = what fits into the free memory, on which the last bits of the result then depend
     minibatch_size: int | None = number(1, low=1)
 
 
@@ -56,19 +50,12 @@ class Network(Protocol):
 
 @dataclass(frozen=True)
 class ViewOutput:
-    """Part of a network's output for one view that the prior uses.
+    """Part of a network's output for one view that the prior uses."""
 
-    Args:
-        points: camera frame, metres, float32 (h, w, 3) on its grid.
-        confidence: float32 (h, w); 1 where the network gives none.
-        is_clear: bool (h, w), False where the network calls the pixel ambiguous.
-        T_reference_view: camera -> the network's own frame, float64 (4, 4).
-    """
-
-    points: np.ndarray
-    confidence: np.ndarray
-    is_clear: np.ndarray
-    T_reference_view: np.ndarray
+    points: np.ndarray  # camera frame, metres, float32 (h, w, 3) on its grid
+    confidence: np.ndarray  # float32 (h, w); 1 where the network gives none
+    is_clear: np.ndarray  # bool (h, w), False where the network calls the pixel ambiguous
+    T_reference_view: np.ndarray  # camera -> the network's own frame, float64 (4, 4)
 
 
 def build_views(

@@ -20,19 +20,16 @@ SQUARE = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True)
 class MaskConfig:
-    """Criteria by which a pixel is left out. Upstream's defaults are in conf/prior/mapanything.yaml.
+    """Criteria by which a pixel is left out. Upstream's defaults are in conf/prior/mapanything.yaml."""
 
-    Args:
-        drop_ambiguous: 1 leaves out what the network itself calls ambiguous (sky, mirrors), 0 keeps it.
-        confidence_percentile: share of a view's pixels, in percent, with the lowest confidence; 0 = none.
-        max_edge_step: depth range over 3 × 3 pixels, relative to the depth, above which there is a depth edge.
-        max_edge_degrees: angle between neighbouring normals above which there is a normal edge. A pixel is left out
-            where both edges are; inf in either keeps all.
-    """
-
+    # 1 leaves out what the network itself calls ambiguous (sky, mirrors), 0 keeps it
     drop_ambiguous: float = number(1.0, low=0, high=1)
+    # share of a view's pixels, in percent, with the lowest confidence; 0 = none
     confidence_percentile: float = number(0.0, low=0, high=100)
+    # depth range over 3 × 3 pixels, relative to the depth, above which there is a depth edge
     max_edge_step: float = number(0.03, low=0, high=math.inf)
+    # angle between neighbouring normals above which there is a normal edge. A pixel is left out where both edges are;
+    # inf in either keeps all
     max_edge_degrees: float = number(5.0, low=0, high=math.inf)
 
 

@@ -21,20 +21,13 @@ LONGER, SHORTER = 518, (168, 252, 294, 336, 392, 518)  # sides of the network's 
 
 @dataclass(frozen=True)
 class Resize:
-    """Mapping of frames of one size onto a network's grid: scaling, then a crop.
-
-    Args:
-        grid: size of what the network sees.
-        scaled: size of the frame before the crop.
-        corner: (left, top) pixel of the crop in the scaled frame.
-        scale: of the intrinsics.
-    """
+    """Mapping of frames of one size onto a network's grid: scaling, then a crop."""
 
     frame: Size
-    grid: Size
-    scaled: Size
-    corner: tuple[int, int]
-    scale: float
+    grid: Size  # size of what the network sees
+    scaled: Size  # size of the frame before the crop
+    corner: tuple[int, int]  # (left, top) pixel of the crop in the scaled frame
+    scale: float  # of the intrinsics
 
 
 def choose_grid(frame: Size) -> Size:

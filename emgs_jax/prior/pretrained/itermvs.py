@@ -37,21 +37,15 @@ def _steps(*default: float) -> Any:
 
 
 class IterMVSConfig(eqx.Module):
-    """Sizes with which the weights were trained.
+    """Sizes with which the weights were trained."""
 
-    Args:
-        num_iterations: of the GRU.
-        num_groups: of channels that are compared by themselves.
-        num_initial: depths all over the range with which it begins.
-        window: bins on either side of the most probable one over which the depth is averaged.
-        finest_steps, middle_steps, coarsest_steps: of the depths around the present one that are tried on the features
-            of a scale, in 1/256 of the range.
-    """
-
-    num_iterations: int = static(4, low=1, high=64)
-    num_groups: int = static(8, low=1, high=16)
-    num_initial: int = static(32, low=2, high=256)
+    num_iterations: int = static(4, low=1, high=64)  # of the GRU
+    num_groups: int = static(8, low=1, high=16)  # of channels that are compared by themselves
+    num_initial: int = static(32, low=2, high=256)  # depths all over the range with which it begins
+    # bins on either side of the most probable one over which the depth is averaged
     window: int = static(4, low=0, high=128)
+    # finest_steps, middle_steps, coarsest_steps: of the depths around the present one that are tried on the features of
+    # a scale, in 1/256 of the range
     finest_steps: tuple[float, ...] = _steps(-2.0, -0.6666667, 0.6666667, 2.0)
     middle_steps: tuple[float, ...] = _steps(-8.0, -2.6666667, 2.6666667, 8.0)
     coarsest_steps: tuple[float, ...] = _steps(-32.0, 32.0)

@@ -11,21 +11,14 @@ from emgs_jax.ops.pytree import static
 
 
 class Conv(eqx.Module):
-    """A convolution whose result is as large as the image, divided by `stride` or multiplied by `expansion`.
+    """A convolution whose result is as large as the image, divided by `stride` or multiplied by `expansion`."""
 
-    Args:
-        weight: rows, columns, channels of the input (one, where each channel is by itself), channels of the output.
-        bias: of each channel of the output.
-        stride: of the result's pixels on the image.
-        dilation: pixels between those that are weighed.
-        expansion: of the image before: 2 is the transposed convolution of three weights with that stride.
-    """
-
+    # rows, columns, channels of the input (one, where each channel is by itself), channels of the output
     weight: Float[Array, "y x i o"]
-    bias: Float[Array, "o"]
-    stride: int = static()
-    dilation: int = static()
-    expansion: int = static()
+    bias: Float[Array, "o"]  # of each channel of the output
+    stride: int = static()  # of the result's pixels on the image
+    dilation: int = static()  # pixels between those that are weighed
+    expansion: int = static()  # of the image before: 2 is the transposed convolution of three weights with that stride
 
 
 def convolve(image: Float[Array, "*b i"], conv: Conv) -> Float[Array, "*b2 o"]:
