@@ -1,7 +1,6 @@
 """Baselines without mapping: predictions averaged per voxel, or their depth fused (TSDF).
 
-Both take views one by one, hold no view afterwards, and are compared like the map: their cloud, and renderings of it.
-Lengths are those of the poses; sizes in metres become such lengths by the unit that a fusion starts with.
+Both take views one by one and keep none. Lengths are in the unit of the poses, to which `start` converts metres.
 """
 
 from collections.abc import Callable
@@ -22,7 +21,7 @@ Draw = Callable[[np.ndarray], Image]  # from the pose T_world_camera (4, 4)
 
 @dataclass(frozen=True)
 class View:
-    """Prediction of one frame, in the frame of its camera and the prior's own lengths."""
+    """Prediction of one frame, in its camera's frame and the prior's unit."""
 
     depth: np.ndarray  # camera-space z (h, w), 0 where there is none
     image: np.ndarray  # RGB, uint8 (h, w, 3)
@@ -31,7 +30,7 @@ class View:
 
 @dataclass(frozen=True)
 class Pinhole:
-    """Of all frames: fx, fy, cx, cy with pixel centres at integers, and the image's size."""
+    """The camera of all frames: fx, fy, cx, cy with pixel centres at integers, and the image's size."""
 
     intrinsics: tuple[float, float, float, float]
     width: int
@@ -43,14 +42,13 @@ class VoxelConfig:
     """The mean of all points of each voxel; see `draw_voxels`."""
 
     voxel_m: float = number(0.02, low=1e-6)
-    # A point is drawn as the square that its voxel covers, but at most so far to each side: what lies just before the
-    # camera would fill the image.
+    # Largest reach of a point's square to each side: a voxel just before the camera would fill the image.
     max_footprint_px: int = number(8, low=1, high=4096)
     surface_depth: float = number(0.1, low=0)
     min_points: int = number(10, low=1)
 
     def start(self, pinhole: Pinhole, unit: float) -> "Fusion":
-        """Without any view; a length of the poses is `unit` metres."""
+        """Start an empty fusion; a length of the poses is `unit` metres."""
         return _Voxels(replace(self, voxel_m=self.voxel_m / unit), pinhole)
 
 
@@ -58,8 +56,7 @@ class VoxelConfig:
 class TsdfConfig:
     """A truncated signed distance field (Curless and Levoy 1996), fused by Open3D on the CPU.
 
-    Behind a depth edge the field of the front surface is written into free space as far as the truncation reaches, and
-    surfaces nearer to each other than that disturb each other.
+    Surfaces nearer to each other than the truncation disturb each other.
     """
 
     voxel_m: float = number(0.02, low=1e-6)
@@ -74,7 +71,7 @@ class TsdfConfig:
             )
 
     def start(self, pinhole: Pinhole, unit: float) -> "Fusion":
-        """Without any view; a length of the poses is `unit` metres."""
+        """Start an empty fusion; a length of the poses is `unit` metres."""
         lengths = replace(self, voxel_m=self.voxel_m / unit, truncation_m=self.truncation_m / unit)
         return _Tsdf(lengths, pinhole)
 
@@ -83,7 +80,7 @@ BaselineConfig = VoxelConfig | TsdfConfig
 
 
 class _Voxels:
-    """A reconstruction that grows by views."""
+    """The mean of the points of each voxel."""
 
     def __init__(self, config: VoxelConfig, pinhole: Pinhole) -> None:
         self._config, self._pinhole, self._points = config, pinhole, SpooledCloud()
@@ -94,11 +91,11 @@ class _Voxels:
         self._points.append(transform_cloud(view.cloud, motion))
 
     def cloud(self) -> PointCloud:
-        """The cloud that is fused so far, with normals towards the cameras."""
+        """The fused cloud so far, with normals towards the cameras."""
         return self._points.averaged(self._config.voxel_m).cloud()
 
     def renderer(self) -> Draw:
-        """Draws what there is so far."""
+        """Return a function that draws the fused cloud so far."""
         means = self._points.averaged(self._config.voxel_m)
         blocks = _Blocks(means.cloud(), means.counts(), _BLOCK_VOXELS * self._config.voxel_m)
 
@@ -111,9 +108,9 @@ class _Voxels:
 
 
 class _Tsdf:
-    """Another one, with the same methods."""
+    """Open3D's TSDF, with the methods of `_Voxels`."""
 
-    _BLOCK, _BLOCKS = 8, 2000  # voxels a side, and blocks to begin with: there is more memory where it is needed
+    _BLOCK, _BLOCKS = 8, 2000  # voxels a side; blocks at the start, which grow
     # In voxels. Open3D finds no surface where the field is exactly 0 at a voxel, as for a wall at a round distance.
     _SHIFT = 0.37
 
@@ -135,7 +132,7 @@ class _Tsdf:
         matrix = np.array([[fx, 0.0, cx + 0.5], [0.0, fy, cy + 0.5], [0.0, 0.0, 1.0]])
         T_camera_world = self._tensor(np.linalg.inv(self._shifted(T_world_camera)))
         limits = 1.0, float(2.0 * depth.max()), self._config.truncation_m / self._config.voxel_m
-        # It makes room for every fourth pixel only, between which small images have no blocks: each pixel is four here.
+        # It makes blocks for every fourth pixel only, so small images would have gaps: each pixel becomes four here.
         dense = self._image(depth.repeat(4, axis=0).repeat(4, axis=1))
         larger = self._tensor(np.diag([4.0, 4.0, 1.0]) @ matrix)
         blocks = self._grid.compute_unique_block_coordinates(dense, larger, T_camera_world, *limits)
@@ -148,7 +145,7 @@ class _Tsdf:
         found = self._grid.extract_point_cloud(self._threshold).point
         rows = [found[name].numpy().astype(np.float64) for name in ("positions", "normals", "colors")]
         rows[0] -= self._shift
-        order = np.lexsort(rows[0].T)  # threads find them in any order
+        order = np.lexsort(rows[0].T)  # threads return them in any order
         return PointCloud(*(values[order] for values in rows))
 
     def renderer(self) -> Draw:
@@ -190,7 +187,7 @@ Fusion = _Voxels | _Tsdf
 
 
 class _Blocks:
-    """Points of a cloud by cubes of the world, of which a camera sees few: a view costs what it shows."""
+    """Points of a cloud by cubes of the world: a view takes only the cubes that the camera sees."""
 
     def __init__(self, cloud: PointCloud, counts: np.ndarray, side: float) -> None:
         self.cloud, self.counts, self._side = cloud, counts, side
@@ -200,7 +197,7 @@ class _Blocks:
         self._centers, self._parts = cell_centers(found, side), np.split(self._order, begins[1:])
 
     def before(self, T_world_camera: np.ndarray, pinhole: Pinhole, config: VoxelConfig) -> np.ndarray:
-        """Rows, ascending, of the cubes whose surrounding sphere reaches into what the camera sees."""
+        """Rows, ascending, of the cubes whose bounding sphere meets the camera's frustum."""
         radius = 0.5 * np.sqrt(3.0) * self._side + np.sqrt(2.0) * config.voxel_m
         centers = rotated(self._centers - T_world_camera[:3, 3], T_world_camera[:3, :3].T)
         is_near = centers[:, 2] > -radius
@@ -217,16 +214,12 @@ class _Blocks:
 def draw_voxels(
     cloud: PointCloud, counts: np.ndarray, T_world_camera: np.ndarray, pinhole: Pinhole, config: VoxelConfig
 ) -> Image:
-    """Draw averaged points as squares parallel to the image, as large as their voxel; a pixel shows its front surface.
+    """Draw averaged points as squares parallel to the image, as large as their voxel; `counts` (n,) are their points.
 
-    The voxels that cover a pixel are one surface as far as none is farther behind the one before than a fraction
-    `surface_depth` of its depth. The first one with `min_points` points is seen, at their median depth, as ours is at
-    the median of its layers: the nearest voxel of all would be the nearest error of all frames. Where no surface has so
-    many the one with most is seen. A square reaches ceil(half the side in pixels) pixels to each side of the point's
-    own: a point may lie anywhere in its voxel.
-
-    Args:
-        counts: (n,) points of each voxel.
+    The voxels of a pixel form one surface until one lies farther behind the one before than `surface_depth` times its
+    depth. The first surface with `min_points` points is drawn at their median depth, else the one with most points: the
+    nearest voxel would be the nearest error of all frames. A square reaches ceil(half the side) pixels to each side of
+    the point's pixel, as the point may lie anywhere in its voxel.
     """
     fx, fy, cx, cy = pinhole.intrinsics
     points = rotated(cloud.points - T_world_camera[:3, 3], T_world_camera[:3, :3].T)
@@ -258,10 +251,7 @@ def draw_voxels(
 def _front(
     pixel: np.ndarray, depth: np.ndarray, counts: np.ndarray, config: VoxelConfig
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Every pixel that is covered, once, and the row with the median of the points of its front surface.
-
-    Rows are ordered by pixel, and from near to far.
-    """
+    """Each covered pixel, and the row of its front surface's median point; rows go by pixel and from near to far."""
     is_next = pixel[1:] == pixel[:-1]
     begins = np.concatenate([[True], ~is_next | (np.diff(depth) > config.surface_depth * depth[:-1])])
     first = np.flatnonzero(begins)  # rows of surfaces

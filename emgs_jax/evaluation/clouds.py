@@ -1,4 +1,4 @@
-"""Point clouds: reading and moving them, and averaging them per voxel without holding all points at once."""
+"""Point clouds: read them, move them, and average them per voxel without holding all points at once."""
 
 import os
 import threading
@@ -17,13 +17,13 @@ from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 _NORMALS, _COLORS = ("nx", "ny", "nz"), ("red", "green", "blue")
-PART_ROWS = 500_000  # points that are worked on together: bounds the memory, does not change the result
-SOME = 61  # every so manieth point says where a cloud is divided
+PART_ROWS = 500_000  # points in memory at a time; does not change the result
+SOME = 61  # of so many points one decides where a cloud is divided
 
 
 @dataclass(frozen=True)
 class PointCloud:
-    """Points with attributes; float64 rows. A normal of zero is unknown and left out of the normal metrics."""
+    """Points with attributes, float64; a normal of zero is unknown and left out of metrics of normals."""
 
     points: np.ndarray  # (n, 3), metres
     normals: np.ndarray  # (n, 3), unit length and towards the camera that saw them, or zero
@@ -34,10 +34,7 @@ class PointCloud:
 
 
 def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:
-    """Read a PLY; a cloud without normals gets those of planes through so many nearest points, sign unknown.
-
-    Normals that are 0, as 3DGS writes them, are none; the others get length 1.
-    """
+    """Read a PLY; where a normal is missing or 0, it is that of a plane through the nearest points, sign unknown."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"{path} is no file: give a PLY file with the points in the trajectory's frame")
     vertices = read_vertices(path)
@@ -57,7 +54,7 @@ def read_cloud(path: str | os.PathLike, normal_neighbours: int) -> PointCloud:
 
 
 def _columns(vertices: Mapping[str, np.ndarray], names: Sequence[str], path: object) -> np.ndarray:
-    """Properties (n, 3) as float64, colours as fractions of 1, 255 or 65535, by their largest; all must be finite."""
+    """Stack finite properties as float64 (n, 3); colours are divided by 1, 255 or 65535, by the largest."""
     rows = np.stack([vertices[name].astype(np.float64) for name in names], axis=1)
     num_broken = int((~np.isfinite(rows).all(1)).sum())
     if num_broken:
@@ -65,15 +62,12 @@ def _columns(vertices: Mapping[str, np.ndarray], names: Sequence[str], path: obj
         raise ValueError(f"{path}: {num_broken} of {len(rows)} {what}: leave them out of the file")
     if names != _COLORS:
         return rows
-    is_float = vertices[names[0]].dtype.kind == "f"  # programs write 0 … 255 in any kind
+    is_float = vertices[names[0]].dtype.kind == "f"  # programs write 0 … 255 in any type
     return rows / next((top for top in (1.0,) * is_float + (255.0, 65535.0) if rows.max(initial=0.0) <= top), np.inf)
 
 
 def _fitted_normals(points: np.ndarray, num_neighbours: int) -> np.ndarray:
-    """Normals (n, 3) of planes through the nearest distinct points, sign unknown; 0 where these lie on a line.
-
-    In a mesh whose triangles share no vertices each point is there many times, which are one for a plane.
-    """
+    """Normals (n, 3) of planes through the nearest distinct points, sign unknown; 0 where these lie on a line."""
     distinct, rows = np.unique(points, axis=0, return_inverse=True)
     search, normals = NearestPoints(distinct), np.zeros_like(distinct)
     for begin in range(0, len(distinct), PART_ROWS // num_neighbours):
@@ -86,16 +80,16 @@ def _fitted_normals(points: np.ndarray, num_neighbours: int) -> np.ndarray:
 
 
 def transform_cloud(cloud: PointCloud, alignment: Sim3) -> PointCloud:
-    """Bring a cloud into the reference's frame."""
+    """Apply a Sim(3) to a cloud."""
     return PointCloud(alignment.apply(cloud.points), rotated(cloud.normals, alignment.rotation), cloud.colors)
 
 
 @dataclass(frozen=True)
 class VoxelMeans:
-    """The mean of each occupied voxel of a cloud, in parts that need not be in memory together.
+    """The mean of each occupied voxel of a cloud, in parts on disk.
 
-    A part has rows (n, 10): point, normal (unit length, or zero), colour, and how many points there were; or (n, 7)
-    without colours. They are by the number of their cell, in one part and from part to part.
+    A part has rows (n, 10): point, normal (unit or zero), colour and number of points; or (n, 7) without colours. All
+    rows are sorted by the number of their cell.
     """
 
     parts: Spool
@@ -123,26 +117,25 @@ class VoxelMeans:
         return np.concatenate([np.empty((0, self.width), np.float32), *found])
 
     def cloud(self) -> PointCloud:
-        """All of them."""
+        """All means."""
         return _cloud(np.concatenate([np.empty((0, 10), np.float32), *self.tables()]))
 
     def counts(self) -> np.ndarray:
-        """Count the points of each row of `cloud`."""
+        """The number of points of each row of `cloud`."""
         return np.concatenate([np.empty(0), *(part[:, -1] for part in self.tables())])
 
 
 class SpooledRows:
-    """Rows (n, c) that begin with a place, in a temporary file, until the side of a voxel is known.
+    """Rows (n, c) that begin with a position, in a temporary file until the side of a voxel is known.
 
-    What is not metric has a unit that only its alignment tells: 1 cm of the truth is .01 of one estimate's lengths and
-    .00001 of another's. Rows without a finite place are dropped.
+    Only the alignment tells the unit of an estimate. Rows without a finite position are dropped.
     """
 
     def __init__(self, dtype: type = np.float32) -> None:
         self._parts, self._some, self._count, self.dtype = Spool(), [np.empty((0, 3), dtype)], 0, dtype
 
     def append(self, rows: np.ndarray) -> None:
-        """Add some rows."""
+        """Add rows."""
         is_finite = np.isfinite(rows[:, 0]) & np.isfinite(rows[:, 1]) & np.isfinite(rows[:, 2])
         rows = (rows if is_finite.all() else rows[is_finite]).astype(self.dtype, copy=False)
         self._parts.append(rows)
@@ -153,17 +146,15 @@ class SpooledRows:
         return self._count
 
     def by_ranges(self, voxel: float, read: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Iterator:
-        """What `read` makes of the rows, one range of cells of the world grid after the other.
-
-        What is in one range is in memory at a time, about `PART_ROWS` rows, in the order in which it was added.
+        """Yield the rows by ranges of cells, about `PART_ROWS` rows at a time, in the order in which they were added.
 
         Args:
             voxel: side of a cell.
-            read: of rows that were added together: the numbers of their cells, and what is given back of them.
+            read: maps rows that were added together to the numbers of their cells, and to what is yielded of them.
         """
         numbers, num_parts = np.sort(cell_numbers(np.concatenate(self._some), voxel)), -(-len(self) // PART_ROWS)
         edges = numbers[len(numbers) * np.arange(1, num_parts) // max(num_parts, 1)]
-        if not len(edges):  # one range holds all of them
+        if not len(edges):  # one range
             parts = [read(self._parts[part])[1] for part in range(len(self._parts))]
             yield from [np.concatenate(parts)] if parts else ()
             return
@@ -181,11 +172,11 @@ class SpooledRows:
 
 
 class SpooledCloud:
-    """All points of many clouds as `SpooledRows` (n, 9) of `dtype`: point, normal, colour; (n, 6) without colours."""
+    """The points of many clouds as `SpooledRows` (n, 9): point, normal, colour; (n, 6) without colours."""
 
     def __init__(self, dtype: type = np.float32, has_colors: bool = True) -> None:
         self._rows, self._width = SpooledRows(dtype), 9 if has_colors else 6
-        self._averaged: tuple[float, VoxelMeans] | None = None  # the last answer: one alignment serves several numbers
+        self._averaged: tuple[float, VoxelMeans] | None = None  # the last result, for several metrics of one alignment
         self._averaging = threading.Lock()
 
     def append(self, cloud: PointCloud) -> None:
@@ -200,7 +191,7 @@ class SpooledCloud:
         return len(self._rows)
 
     def averaged(self, voxel: float) -> VoxelMeans:
-        """The means of all points of each voxel [lengths of the clouds] of the world grid, however they were spread."""
+        """The mean of each voxel of the world grid; `voxel` is its side, in the clouds' unit."""
         with self._averaging:
             if self._averaged is None or self._averaged[0] != voxel:
                 means, sizes = Spool(), []
@@ -212,7 +203,7 @@ class SpooledCloud:
 
 
 def spooled(clouds: Iterable[PointCloud], dtype: type = np.float32, has_colors: bool = True) -> SpooledCloud:
-    """The points of all clouds, one in memory at a time."""
+    """Spool clouds, one in memory at a time."""
     found = SpooledCloud(dtype, has_colors)
     for cloud in clouds:
         found.append(cloud)
@@ -225,12 +216,12 @@ def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
 
 
 def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
-    """Average the points of each voxel [m]; doing it twice changes nothing."""
+    """Average the points of each voxel [m]; idempotent."""
     return spooled([cloud], np.float64).averaged(voxel).cloud()
 
 
 def coarse_points(parts: Iterable[np.ndarray], voxel: float) -> np.ndarray:
-    """Mean (n, 3) of the points (m, 3) of all parts in each voxel; one part is in memory at a time."""
+    """Mean (n, 3) in each voxel of the points (m, 3) of all parts; one part is in memory at a time."""
     tables = [(np.empty(0, np.int64), np.empty((0, 4)))]
     for points in parts:
         tables.append(_sum_cells(cell_numbers(points, voxel), np.column_stack([points, np.ones(len(points))])))
@@ -239,12 +230,9 @@ def coarse_points(parts: Iterable[np.ndarray], voxel: float) -> np.ndarray:
 
 
 def cell_numbers(points: np.ndarray, voxel: float) -> np.ndarray:
-    """Number (n,) of the voxel [m] of the world that each finite point (n, 3) is in, 21 bits an axis.
-
-    What is farther than a million voxels shares the border cells.
-    """
+    """Number of the voxel [m] of each finite point (n, 3), 21 bits an axis; beyond a million voxels a border cell."""
     numbers = np.zeros(len(points), np.int64)
-    for axis in range(3):  # column by column, as there may be millions of rows
+    for axis in range(3):  # by column, as there may be millions of rows
         cells = np.asarray(points[:, axis], np.float64) / voxel
         np.floor(cells, out=cells)
         np.clip(cells, -(2.0**20), 2.0**20 - 1, out=cells)
@@ -256,26 +244,25 @@ def cell_numbers(points: np.ndarray, voxel: float) -> np.ndarray:
 def cell_centers(numbers: np.ndarray, voxel: float) -> np.ndarray:
     """Centres (n, 3) of the voxels with these `cell_numbers`."""
     centers = np.empty((len(numbers), 3))
-    for axis, shift in enumerate((42, 21, 0)):  # by itself, as there may be tens of millions
+    for axis, shift in enumerate((42, 21, 0)):  # by column, as there may be tens of millions of rows
         centers[:, axis] = ((numbers >> shift) & (2**21 - 1)) - 2**20 + 0.5
     centers *= voxel
     return centers
 
 
 class NearestPoints:
-    """Exact nearest neighbours among points (n, 3) of any unit; other threads run while it builds and searches."""
+    """Exact nearest neighbours among points (n, 3); releases the GIL."""
 
     def __init__(self, points: np.ndarray) -> None:
         self.points = np.ascontiguousarray(points, np.float64)
-        # `compact_nodes` would shrink each node to its points: a query that is far from all of them then visits ten
-        # times as many leaves, with the same answer.
+        # With `compact_nodes` a query far from all points visits ten times as many leaves.
         self._tree = cKDTree(self.points, leafsize=32, balanced_tree=False, compact_nodes=False)
 
     def __len__(self) -> int:
         return len(self.points)
 
     def query(self, queries: np.ndarray, num_neighbours: int = 1) -> tuple[np.ndarray, np.ndarray]:
-        """Distances and rows, (m, k) each and the nearest first, of k = min(`num_neighbours`, n) points."""
+        """Distances and rows (m, k) of the k = min(`num_neighbours`, n) nearest points, nearest first."""
         k = min(num_neighbours, len(self))
         if not k or not len(queries):
             return np.empty((len(queries), k)), np.empty((len(queries), k), np.int64)
@@ -283,10 +270,10 @@ class NearestPoints:
 
 
 def register(points: np.ndarray, target: NearestPoints, max_distance: float, max_steps: int) -> Sim3:
-    """Find the rigid motion of points (n, 3) onto those of a target by point-to-point ICP (Besl and McKay 1992).
+    """Find the rigid motion of points (n, 3) onto a target by point-to-point ICP (Besl and McKay 1992).
 
-    Pairs are nearest points within `max_distance` [m]; ends when a step moves them by less than a hundred
-    thousandth of it (RMS). With fewer than 3 pairs nothing holds the cloud: it stays where it is.
+    Pairs are nearest points within `max_distance` [m]. Ends when a step moves them by less than 1e-5 of it (RMS), or
+    with fewer than 3 pairs.
     """
     found, moved, shift = Sim3(1.0, np.eye(3), np.zeros(3)), points, np.inf
     for _ in range(max_steps if len(target) else 0):
@@ -305,20 +292,20 @@ def _cloud(rows: np.ndarray) -> PointCloud:
 
 
 def _means(rows: np.ndarray, voxel: float) -> np.ndarray:
-    """Rows of `VoxelMeans` of points with attributes (n, 9) or (n, 6), of their precision."""
+    """Rows of `VoxelMeans` from rows (n, 9) or (n, 6)."""
     _, sums = _sum_cells(cell_numbers(rows[:, :3], voxel), np.column_stack([rows, np.ones(len(rows))]))
     sums[:, :-1] /= sums[:, -1:]
     length = np.linalg.norm(sums[:, 3:6], axis=1, keepdims=True)
-    # Two sides of a thin sheet cancel: a short mean says nothing about the direction.
+    # Normals of the two sides of a thin sheet cancel: a short mean has no direction.
     sums[:, 3:6] = np.where(length > 0.1, sums[:, 3:6] / np.maximum(length, 0.1), 0.0)
     return sums.astype(rows.dtype)
 
 
 def _sum_cells(keys: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Sum the rows (n, c) of equal keys (n,) to float64, in the order in which they stand."""
+    """Sum the rows (n, c) of equal keys (n,) in float64, in their order."""
     order = np.argsort(keys, kind="stable")
     keys = keys[order]
     begins = np.flatnonzero(np.diff(keys, prepend=-1))
-    # A sparse matrix that picks the rows of each cell: whole rows are read once, whatever the number of columns.
+    # A sparse matrix that picks the rows of each cell reads whole rows once.
     picks = csr_array((np.ones(len(keys)), order, np.append(begins, len(keys))), shape=(len(begins), len(keys)))
     return keys[begins], picks @ rows

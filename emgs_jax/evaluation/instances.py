@@ -1,4 +1,4 @@
-"""Objects in a map: the Gaussians that are answers to one word, in clusters."""
+"""Objects in a map: clusters of the Gaussians that answer to a word."""
 
 from dataclasses import dataclass
 
@@ -10,10 +10,10 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class InstanceConfig:
-    """Clustering of a query's answers into objects (DBSCAN): those within reach of each other are one."""
+    """Clustering of a query's answers into objects by DBSCAN."""
 
     reach: float = number(3.0, low=1e-6, high=1e6)  # in median distances between nearest Gaussians of the map
-    min_gaussians: int = number(3, low=1, high=10**6)  # within `reach` of one, itself included: DBSCAN's minPts
+    min_gaussians: int = number(3, low=1, high=10**6)  # DBSCAN's minPts: within `reach` of one, itself included
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ class Instance:
     """One object, in the frame and unit of the map."""
 
     center: np.ndarray
-    low: np.ndarray  # of the box along the map's axes that holds its Gaussians' means with one standard deviation
+    low: np.ndarray  # of its Gaussians' bounding box along the map's axes, one standard deviation around the means
     high: np.ndarray
     score: float
     lead: float
@@ -29,14 +29,14 @@ class Instance:
 
 
 def reach_of(means: np.ndarray, config: InstanceConfig) -> float:
-    """The distance within which answers belong together, in the unit of means (n, 3); 0 for fewer than two."""
+    """DBSCAN's ε in the unit of means (n, 3); 0 for fewer than two."""
     if len(means) < 2:
         return 0.0
     return config.reach * float(np.median(cKDTree(means).query(means, k=2)[0][:, 1]))
 
 
 def clusters(points: np.ndarray, reach: float, min_points: int) -> np.ndarray:
-    """DBSCAN: the cluster of each point (n, 3), from 0; -1 for noise."""
+    """The cluster of each point (n, 3) by DBSCAN, from 0; -1 for noise."""
     if not len(points) or reach <= 0:
         return np.full(len(points), -1)
     import open3d as o3d  # slow to import
@@ -52,12 +52,11 @@ def find_instances(
     reach: float,
     min_gaussians: int,
 ) -> list[Instance]:
-    """The objects that one word finds, the one with the largest sum of cosines first.
+    """Cluster the Gaussians that answer to a word (rows `answers`), the largest sum of cosines first.
 
     Args:
-        answers: rows of the Gaussians that answer to the word.
-        shape: means (n, 3) and covariances (n, 3, 3) of all.
-        strength: cosine and lead (n,) of all with this word.
+        shape: means (n, 3) and covariances (n, 3, 3) of all Gaussians.
+        strength: their cosines and leads (n,).
     """
     means, covs = (np.asarray(values, np.float64) for values in shape)
     cosines, leads = (np.asarray(values, np.float64) for values in strength)

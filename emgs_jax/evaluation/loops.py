@@ -1,4 +1,4 @@
-"""Places seen again: whether loops are right and all found, and how much of a map stands twice, as drift leaves it."""
+"""Precision and recall of loops, and the share of a map that drift has doubled."""
 
 from collections.abc import Sequence
 
@@ -8,28 +8,27 @@ from scipy.spatial import cKDTree
 from emgs_jax.geometry import pose_difference
 
 MAX_GAP_M = 0.15  # layers farther apart may be two surfaces
-MAX_GAP = 4.0  # likewise where metres are not known, as a multiple of how far Gaussians stand apart
+MAX_GAP = 4.0  # likewise without metres, as a multiple of the Gaussians' spacing
 MIN_COS = 0.9  # of their normals; the two sides of a board face opposite ways
-MIN_STDS = 2.0  # what is nearer is one layer, as thick as it is
-PLACE_M, PLACE_DEG = 1.0, 30.0  # two frames that are nearer than this show one place
-RIGHT_M, RIGHT_DEG = 0.3, 10.0  # a loop that errs by more is false
-_CHUNK = 512  # Gaussians whose neighbours are looked at together: of a desk each has a thousand within the gap
-REACH = 10  # frames by which a loop beside them finds the others of a visit
+MIN_STDS = 2.0  # nearer Gaussians are one thick layer
+PLACE_M, PLACE_DEG = 1.0, 30.0  # two frames nearer than this show one place
+RIGHT_M, RIGHT_DEG = 0.3, 10.0  # a loop with a larger error is false
+_CHUNK = 512  # Gaussians at a time; each may have a thousand neighbours
+REACH = 10  # frames beside a loop that count as found with it
 
 
 def loop_metrics(
     loops: Sequence[tuple[int, int, np.ndarray]], truth: Sequence[np.ndarray | None], min_gap: int
 ) -> dict[str, float | int | None]:
-    """Precision and recall of loops, `None` where there is nothing to be right or to be found.
+    """Precision and recall of loops; None where undefined.
 
-    A loop is right where its measured motion is the true one up to 30 cm and 10°. A frame comes back where it is within
-    1 m and 30° of one at least `min_gap` frames older; it is found where a right loop begins within 10 frames of it.
-    Where only loops begin there that nobody can judge, as those into a saved map, it counts neither way.
+    A loop is right if its motion errs by at most 30 cm and 10°. A frame returns if it is within 1 m and 30° of one at
+    least `min_gap` frames older, and is found if a right loop begins within 10 frames of it. It does not count if only
+    loops without truth begin there, such as those into a saved map.
 
     Args:
         loops: frames a and b and the measured pose of camera b in camera a, metres, (4, 4).
         truth: T_world_camera (4, 4) of every frame; None where unknown.
-        min_gap: frames between a place and a return to it.
     """
     judged = [loop for loop in loops if truth[loop[0]] is not None and truth[loop[1]] is not None]
     right = [b for a, b, measured in judged if _is_right(measured, truth[a], truth[b])]
@@ -53,7 +52,7 @@ def _is_right(measured: np.ndarray, true_a: np.ndarray, true_b: np.ndarray) -> b
 
 
 def _returning(truth: Sequence[np.ndarray | None], min_gap: int) -> list[int]:
-    """Frames that see a place again."""
+    """Frames that return to a place."""
     rows, found = [row for row, pose in enumerate(truth) if pose is not None], []
     poses = np.array([truth[row] for row in rows])
     for row in rows:
@@ -68,20 +67,15 @@ def _returning(truth: Sequence[np.ndarray | None], min_gap: int) -> list[int]:
 def double_wall_share(
     means: np.ndarray, normals: np.ndarray, covs: np.ndarray, metre: float | None = 1.0
 ) -> float | None:
-    """Share of Gaussians that have another beside them on a second layer.
+    """Share of Gaussians, in [0, 1], with another on a second layer; None for fewer than two.
 
-    That is one with a normal alike, nearer across than Gaussians stand apart (median distance to the nearest one), and
-    along the normal between two standard deviations and 15 cm away, or four times that distance where no metre is
-    known. What truly stands that near behind another, facing the same way, counts too: compare maps of one scene.
+    The other has a similar normal, lies nearer across than the Gaussians' spacing (median distance to the nearest), and
+    along the normal between two standard deviations and 15 cm away, or four spacings without a metre. True surfaces so
+    close behind another count too: compare maps of one scene.
 
     Args:
-        means: (n, 3), in any unit.
-        normals: (n, 3), unit vectors.
-        covs: (n, 3, 3), of that unit squared.
-        metre: in that unit; None where it is not known.
-
-    Returns:
-        In [0, 1]; None for fewer than two Gaussians.
+        means: (n, 3) in any unit, with unit normals (n, 3) and covariances (n, 3, 3).
+        metre: in that unit; None if unknown.
     """
     if len(means) < 2:
         return None
@@ -104,7 +98,7 @@ def double_wall_share(
 def _is_behind(
     offset: np.ndarray, normal: np.ndarray, covs: tuple[np.ndarray, np.ndarray], spacing: float, max_gap: float
 ) -> np.ndarray:
-    """Test pairs (n,) for two layers, by their distance (n, 3), a normal of both (n, 3) and covariances (n, 3, 3)."""
+    """Test pairs (n,) for two layers, by their offset (n, 3), a normal of both (n, 3) and covariances (n, 3, 3)."""
     normal = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     gap = np.abs(np.einsum("nd,nd->n", offset, normal))
     across = np.sqrt(np.maximum(np.einsum("nd,nd->n", offset, offset) - gap**2, 0.0))

@@ -1,4 +1,4 @@
-"""Distance of a reconstructed cloud from the true one: building both clouds, accuracy, completion, F1, normals."""
+"""Compare a reconstructed cloud with the true one: accuracy, completion, F1, normals."""
 
 import itertools
 import math
@@ -27,43 +27,40 @@ from emgs_jax.geometry import Sim3
 from emgs_jax.ops.ranges import number, one_of
 
 Metrics = dict[str, float | int | str | None]
-_BAND_ROWS = 40  # of an image whose normals are fitted at a time: what is computed in between stays in the cache
+_BAND_ROWS = 40  # of an image whose normals are fitted at a time, so that intermediate values stay in the cache
 
 
 @dataclass(frozen=True)
 class EvaluationConfig:
-    """The protocol of a comparison; it is written into every result. Values: conf/evaluation."""
+    """The protocol of a comparison, which is written into every result. Values: conf/evaluation."""
 
     protocol: str
     alignment: str = one_of("sim3", "se3", default="sim3")  # se3: without the scale
     statistic: str = one_of("mean", "rmse", default="mean")  # of the distances
-    # longer distances count as this long; F1 does not change
-    max_distance_m: float = number(math.inf, low=1e-6, high=math.inf)
+    max_distance_m: float = number(math.inf, low=1e-6, high=math.inf)  # clips distances, but not for F1
     max_depth_m: float = number(math.inf, low=1e-6, high=math.inf)  # true depth farther away is left out
-    icp_distance_m: float = number(0.0, low=0)  # ICP after the alignment takes pairs within this distance; 0 = no ICP
-    placement_icp_m: float = number(0.1, low=1e-6)  # likewise for reconstruction_icp/…, whatever the protocol does
+    icp_distance_m: float = number(0.0, low=0)  # of pairs of ICP after the alignment; 0: no ICP
+    placement_icp_m: float = number(0.1, low=1e-6)  # likewise for reconstruction_icp/…, whatever the protocol
     icp_voxel_m: float = number(0.05, low=1e-4)  # a grid has 2^20 cells to each side of the origin
     icp_max_steps: int = number(30, low=0, high=10000)
     voxel_m: float = number(0.01, low=1e-4)
     max_points: int | None = number(None, low=1, high=1e9)  # compare a random choice of so many points of each cloud
-    num_sampled: int = number(400000, low=1, high=1e9)  # of either cloud, whose distances to all of the other are taken
+    num_sampled: int = number(400000, low=1, high=1e9)  # points of either cloud with a distance to all of the other
     f1_thresholds_m: tuple[float, ...] = number((0.2, 0.05), low=1e-9)
     max_normal_angle_deg: float = number(30.0, low=0, high=180)
     normal_radius_px: int = number(4, low=1, high=64)
     normal_step_px: int = number(2, low=1, high=64)
-    # relative inverse-depth step to a tap of the normal's window
-    max_normal_gap: float = number(0.1, low=0, high=math.inf)
-    max_normal_residual: float = number(0.02, low=0, high=math.inf)  # likewise, distance of a tap from the fitted plane
+    max_normal_gap: float = number(0.1, low=0, high=math.inf)  # relative inverse-depth step to a tap of the window
+    max_normal_residual: float = number(0.02, low=0, high=math.inf)  # likewise, from a tap to the fitted plane
     min_normal_taps: int = number(8, low=3, high=1000)
-    label_neighbours: int = number(5, low=1, high=1000)  # nearest points of the map that vote for a true point's label
+    label_neighbours: int = number(5, low=1, high=1000)  # nearest points of the map that vote for a label
 
 
 def window_normals(points: np.ndarray, valid: np.ndarray, config: EvaluationConfig) -> np.ndarray:
-    """Fit a plane to the window around each pixel of a camera-frame point map (h, w, 3), in camera frame.
+    """Unit normals (h, w, 3) towards the camera, of planes in windows of a point map; float32, zero without a plane.
 
-    On a plane the inverse depth is affine in the ray's (x/z, y/z), so two weighted least-squares passes over shifted
-    images do: the first takes taps without a depth step to the centre, the second those near the first plane.
-    Returns unit normals towards the camera, float32 (h, w, 3); zero where no plane was found.
+    On a plane the inverse depth is affine in (x/z, y/z). The first of two weighted least-squares passes takes taps
+    without a depth step to the centre, the second those near the first plane.
     """
     valid = valid & np.isfinite(points).all(-1) & (points[..., 2] > 1e-6)
     z = np.where(valid, points[..., 2], 1.0).astype(np.float32)
@@ -81,37 +78,36 @@ def window_normals(points: np.ndarray, valid: np.ndarray, config: EvaluationConf
 
 
 def camera_cloud(points: np.ndarray, mask: np.ndarray, image: np.ndarray, config: EvaluationConfig) -> PointCloud:
-    """Turn a camera-frame point map (h, w, 3) with its image, uint8 (h, w, 3), into a cloud in that frame."""
+    """Turn a point map (h, w, 3) and its image, uint8 (h, w, 3), into a cloud, all in the camera's frame."""
     mask = mask & np.isfinite(points).all(-1)
     normals = window_normals(points, mask, config)[mask].astype(np.float64)
     return PointCloud(points[mask].astype(np.float64), normals, image[mask] / 255.0)
 
 
 def posed(cloud: PointCloud, T_world_camera: np.ndarray) -> PointCloud:
-    """A cloud in the frame of a camera, in the world."""
+    """Move a cloud from a camera's frame to the world's."""
     return transform_cloud(cloud, Sim3(1.0, T_world_camera[:3, :3], T_world_camera[:3, 3]))
 
 
 def ground_truth_cloud(
     frames: Iterable[Frame], intrinsics: tuple[float, float, float, float], config: EvaluationConfig
 ) -> PointCloud:
-    """Back-project true depth with true poses; frames without them contribute nothing."""
+    """Back-project true depth by true poses; frames without them contribute nothing."""
 
     def clouds():
         for frame in frames:
             if frame.depth is not None and frame.T_world_camera is not None:
                 depth = frame.static_depth
                 known = (depth > 0) & (depth <= config.max_depth_m)
-                yield posed(
-                    camera_cloud(backproject(depth, intrinsics), known, frame.image, config), frame.T_world_camera
-                )
+                cloud = camera_cloud(backproject(depth, intrinsics), known, frame.image, config)
+                yield posed(cloud, frame.T_world_camera)
 
     return fuse_clouds(clouds(), config.voxel_m)
 
 
 @dataclass(frozen=True)
 class Reference:
-    """The true cloud as a protocol compares with it, made once for all estimates."""
+    """The true cloud, prepared once for all comparisons."""
 
     cloud: PointCloud  # averaged per voxel
     points: NearestPoints
@@ -119,7 +115,7 @@ class Reference:
 
 
 def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
-    """Prepare a true cloud for comparisons under `config`, with either alignment and with or without ICP."""
+    """Prepare a true cloud for comparisons under a protocol, with and without ICP."""
     cloud, coarse = (voxel_downsample(truth, voxel) for voxel in (config.voxel_m, config.icp_voxel_m))
     return Reference(cloud, NearestPoints(cloud.points), NearestPoints(coarse.points))
 
@@ -127,7 +123,7 @@ def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
 def compare_clouds(
     cloud: PointCloud | SpooledCloud, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
 ) -> Metrics:
-    """Bring the estimate's cloud into the frame of the truth as the protocol says; measure how far they are apart."""
+    """Align the estimate's cloud with the truth by the protocol and compare both, see `compare_placements`."""
     return compare_placements(cloud, truth, poses, config, [config.icp_distance_m])[0]
 
 
@@ -138,11 +134,10 @@ def compare_placements(
     config: EvaluationConfig,
     icp_distances_m: Sequence[float],
 ) -> list[Metrics]:
-    """Metrics of the estimate's cloud where its poses put it, moved from there by ICP of each distance (0: left there).
+    """Compare the estimate's cloud, aligned by its poses and then by ICP with each of these distances (0: no ICP).
 
-    The alignment is that of the poses, estimated and true (n, 4, 4); what they leave open is noted, see `align_poses`.
-    A `SpooledCloud` is averaged by `voxel_m` of the truth before, so that its own unit does not matter. ICP moves the
-    cloud rigidly: the scale stays that of the poses.
+    Poses are the estimated and the true ones (n, 4, 4), see `align_poses`. A `SpooledCloud` is first averaged by voxels
+    of the truth's `voxel_m`, whatever its unit. ICP keeps the scale.
     """
     alignment, note = align_poses(*poses, with_scale=config.alignment == "sim3")
     is_spooled = isinstance(cloud, SpooledCloud)
@@ -154,19 +149,19 @@ def compare_placements(
         placed = _moved(source, truth, distance, config) @ alignment
         moved = spooled((transform_cloud(part, placed) for part in own), precision, has_colors=False)
         means = moved.averaged(config.voxel_m)
-        found[distance] = _compare(means, truth, config) | {"reconstruction/alignment_note": note}
+        found[distance] = compare_means(means, truth, config) | {"reconstruction/alignment_note": note}
     return [found[distance] for distance in icp_distances_m]
 
 
 def own_voxel(alignment: Sim3, config: EvaluationConfig) -> float:
-    """Side of a voxel of `voxel_m` in the lengths of the estimate that is aligned."""
+    """`voxel_m` in the unit of the estimate."""
     return config.voxel_m / alignment.scale if alignment.scale > 0 else config.voxel_m
 
 
 def align_points(
     points: np.ndarray, truth: Reference, poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig
 ) -> np.ndarray:
-    """Bring points (n, 3) of the estimate to where `compare_clouds` compares its cloud."""
+    """Move points (n, 3) of the estimate as `compare_clouds` moves its cloud."""
     alignment, _ = align_poses(*poses, with_scale=config.alignment == "sim3")
     if config.icp_distance_m == 0:
         return alignment.apply(points)
@@ -176,28 +171,21 @@ def align_points(
 
 
 def _moved(source: np.ndarray, truth: Reference, distance: float, config: EvaluationConfig) -> Sim3:
-    """The motion of coarse points (n, 3) onto the truth; none for a distance of 0."""
+    """The motion of coarse points (n, 3) onto the truth by ICP; the identity for a distance of 0."""
     return register(source, truth.icp_points, distance, config.icp_max_steps if distance > 0 else 0)
 
 
-def reconstruction_metrics(estimate: PointCloud, truth: Reference, config: EvaluationConfig) -> Metrics:
-    """Compare two clouds in one frame; flat keys, metres and percent.
+def compare_means(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> Metrics:
+    """Compare an averaged cloud with the truth; flat keys, metres and percent; None, with a reason, if one is empty.
 
-    Both clouds are averaged per voxel. Accuracy (estimate → truth) and completion (truth → estimate) are the
-    protocol's statistic of the distances to the nearest point; unless it clips them, one far outlier counts in full.
-    Accuracy and precision are those of `num_sampled` points of the estimate, evenly spread over its voxels, to all of
-    the truth; completion and recall likewise of the truth to all of the estimate. The normal metrics take the nearest
-    neighbours' |cos| and average both directions. Without points the values are None, with a reason.
+    Accuracy (estimate → truth) and completion (truth → estimate) are the protocol's statistic of the distances to the
+    nearest point, from `num_sampled` points, evenly spread over the voxels, to all of the other cloud. Metrics of
+    normals take |cos| of nearest neighbours and average both directions.
     """
-    return _compare(spooled([estimate], np.float64, has_colors=False).averaged(config.voxel_m), truth, config)
-
-
-def _compare(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> Metrics:
-    """`reconstruction_metrics` of an estimate that is averaged already."""
     if not len(means) or not len(truth.cloud):
         which = "ground truth" if len(means) else "estimate"
         return not_compared(config, f"the {which} has no points", len(means))
-    rng = np.random.default_rng(0)  # one for both: equally long clouds must not keep the same rows
+    rng = np.random.default_rng(0)  # one generator: equally long clouds must not keep the same rows
     is_whole = config.max_points is None
     rows = _spread(len(means), config.num_sampled, rng) if is_whole else _choice(len(means), config.max_points, rng)
     some, kept = means.rows(rows), _choice(len(truth.cloud), config.max_points, rng)
@@ -214,13 +202,13 @@ def _compare(means: VoxelMeans, truth: Reference, config: EvaluationConfig) -> M
 
 
 def not_compared(config: EvaluationConfig, reason: str, num_points: int | None = None) -> Metrics:
-    """The keys of a comparison without values, and the reason why there is none."""
+    """The keys of a comparison without values, and the reason."""
     found: Metrics = dict.fromkeys(_metric_names(config))
     return found | {"reconstruction/num_points": num_points, "reconstruction/reason": reason}
 
 
 def _scores(distances: Sequence[np.ndarray], cosines: Sequence[np.ndarray], config: EvaluationConfig) -> Metrics:
-    """Metrics of distances and |cos| of normals, both from the estimate to the truth and back."""
+    """Metrics of distances and of |cos| of normals, each from the estimate to the truth and back."""
     values = [_average(both, config) for both in distances]
     for threshold in config.f1_thresholds_m:
         precision, recall = (100.0 * np.mean(both <= threshold) for both in distances)
@@ -237,12 +225,12 @@ def _scores(distances: Sequence[np.ndarray], cosines: Sequence[np.ndarray], conf
 def _nearest_means(parts: Iterable[np.ndarray], some: np.ndarray, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Distance of each point (m, 3) to the nearest mean, and the normal (m, 3) there.
 
-    A part of the means is searched for those points that are nearer to it than to `some` (n, 7) of all parts.
+    `some` (n, 7) of all parts bound the distances: a part is searched only for points that it may be nearer to.
     """
     distances, rows = (values[:, 0] for values in NearestPoints(some[:, :3]).query(points))
     normals, x = some[rows, 3:6], points[:, 0]
     for part in parts:
-        # Parts lie one behind the other along the first axis.
+        # Parts are sorted along the first axis.
         near = np.flatnonzero(np.maximum(part[:, 0].min() - x, x - part[:, 0].max()) < distances)
         nearer, rows = (values[:, 0] for values in NearestPoints(part[:, :3]).query(points[near]))
         closer = nearer < distances[near]
@@ -256,14 +244,14 @@ def _average(distances: np.ndarray, config: EvaluationConfig) -> float:
 
 
 def _choice(count: int, at_most: int | None, rng: np.random.Generator) -> np.ndarray:
-    """Ascending numbers below `count`, at most so many of them at random."""
+    """Ascending numbers below `count`: all, or a random choice of `at_most`."""
     if at_most is None or count <= at_most:
         return np.arange(count)
     return np.sort(rng.choice(count, at_most, replace=False))
 
 
 def _spread(count: int, at_most: int, rng: np.random.Generator) -> np.ndarray:
-    """Likewise, one at random of each of `at_most` equal ranges."""
+    """Likewise, a random one of each of `at_most` equal ranges."""
     if count <= at_most:
         return np.arange(count)
     return ((np.arange(at_most) + rng.random(at_most)) * (count / at_most)).astype(np.int64)
@@ -292,8 +280,8 @@ def _fit_planes(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Fit inverse depth = centre's + offset + slopes · (ray − centre's ray) around every pixel of samples (3, h, w).
 
-    Takes the taps within `gap` (h, w) of the planes with these slopes (2, h, w) and offset (h, w). Returns slopes and
-    offset, and whether there were enough taps in both directions.
+    Takes the taps within `gap` (h, w) of the given planes. Returns slopes (2, h, w), offset (h, w), and where enough
+    taps lay in both directions.
     """
     (_, h, w), radius = samples.shape, config.normal_radius_px
     padded, is_valid = np.pad(samples, ((0, 0), (radius, radius), (radius, radius))), np.pad(valid, radius)

@@ -1,4 +1,4 @@
-"""Errors of depth, colours and classes that are rendered from the poses of a run, against its frames."""
+"""Compare depth, colours and classes rendered from a run's poses with its frames."""
 
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
@@ -15,22 +15,22 @@ _TOLERANCE = 0.05  # of the true depth; it is in the name of the metric
 
 @dataclass(frozen=True)
 class ViewScore:
-    """Errors of one rendered view against its frame. Shares are of the pixels whose true depth is known."""
+    """Errors of one rendered view; shares are of the pixels with true depth."""
 
     coverage: float  # share with a rendered depth
     within: float  # share whose rendered depth is within 5 % of the truth
     depth_l1: float | None = None  # mean absolute error of the depth, m; None where nothing is covered
-    squared_error: float = 0.0  # of the colours, RGB in [0, 1], summed over the covered pixels and channels
-    num_colors: int = 0  # how many numbers that are; 0 where no colours were rendered
-    confusion: np.ndarray | None = None  # of the pixels whose true class is known, where classes are compared
+    squared_error: float = 0.0  # of RGB in [0, 1], summed over covered pixels and channels
+    num_colors: int = 0  # number of summands; 0 without rendered colours
+    confusion: np.ndarray | None = None  # of the pixels with a true class, if classes are compared
 
 
 class Rendered:
-    """Compares what is rendered of one estimate with the frames of a data set, one view after the other.
+    """Compares rendered views with the frames of a data set, one by one.
 
     Args:
-        poses: of the estimate and the true ones (n, 4, 4), for the scale; None: nothing is compared.
-        has_classes: each view comes with the classes of its pixels.
+        poses: estimated and true (n, 4, 4), for the scale; None: nothing is compared.
+        has_classes: views come with the classes of their pixels.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Rendered:
     def add(
         self, row: int, depth: np.ndarray | None, colors: np.ndarray | None, labels: np.ndarray | None = None
     ) -> None:
-        """Add a frame of the data set, `labels` being the class of each pixel, -1 = none; the rest as `score_view`."""
+        """Add the view of a frame; `labels` are the class of each pixel, -1 = none, the rest is as for `score_view`."""
         if self._scale is None:
             return
         frame = self._dataset[row]
@@ -59,7 +59,7 @@ class Rendered:
         self._scores[row] = score
 
     def metrics(self) -> dict[str, float | int | None]:
-        """`rendering_metrics` of the data set, where frames that were not added are lost; empty without truth."""
+        """`rendering_metrics`, where frames that were not added are lost; empty without truth."""
         if self._scale is None:
             return {}
         for row in sorted(set(range(len(self._dataset))) - set(self._scores)):
@@ -68,22 +68,19 @@ class Rendered:
 
 
 def depth_scale(poses: tuple[np.ndarray, np.ndarray], config: EvaluationConfig) -> float:
-    """Factor from the lengths of an estimate to metres, by its poses and the true ones (n, 4, 4); 1 for se3."""
+    """Factor from the estimate's unit to metres, by estimated and true poses (n, 4, 4); 1 for se3."""
     return align_poses(*poses, with_scale=config.alignment == "sim3")[0].scale
 
 
 def score_view(
     frame: Frame, depth: np.ndarray | None, colors: np.ndarray | None, scale: float, max_depth: float
 ) -> ViewScore | None:
-    """Compare what was rendered from the estimated pose of a frame with the frame; None without any true depth.
+    """Compare a rendered view with its frame; None without true depth in (0, `max_depth`].
 
     Args:
-        frame: with its true depth, which counts where it is above 0 and not beyond `max_depth`.
-        depth: rendered camera-space z (h, w) in the lengths of the estimate, 0 where there is none; None for a frame
-            whose pose is lost: nothing of it is covered.
-        colors: rendered RGB in [0, 1], (h, w, 3); None where there are none.
+        depth: rendered camera-space z (h, w) in the estimate's unit, 0 = none; None for a lost frame.
+        colors: rendered RGB in [0, 1], (h, w, 3), or None.
         scale: `depth_scale` of the estimate.
-        max_depth: m.
     """
     truth = frame.static_depth
     is_known = None if truth is None else (truth > 0) & (truth <= max_depth)
@@ -102,13 +99,11 @@ def score_view(
 
 
 def rendering_metrics(views: Iterable[ViewScore | None]) -> dict[str, float | int | None]:
-    """Means over the frames with true depth; flat keys, metres, percent and dB. What is not defined is None.
+    """Means over the frames with true depth; flat keys, metres, percent and dB; None where undefined.
 
-    A lost frame counts as covered nowhere. `rendering/depth_within_5_percent` is a share of all pixels with true depth,
-    so a pixel that was not rendered counts as not within; `rendering/depth_l1_m` is about the rendered ones only, and
-    frames without any are left out of its mean. The PSNR is that of the mean squared error over the covered pixels of
-    all frames together. Classes are counted over the pixels of all frames whose true class is known; a pixel without an
-    answer is wrong.
+    A lost frame is covered nowhere. `rendering/depth_within_5_percent` is a share of all pixels with true depth,
+    rendered or not; `rendering/depth_l1_m` is about rendered ones, and leaves out frames without any. The PSNR is that
+    of all covered pixels together. Of the pixels with a true class one without an answer is wrong.
     """
     views = [view for view in views if view is not None]
     errors = [view.depth_l1 for view in views if view.depth_l1 is not None]

@@ -1,7 +1,7 @@
-"""Semantic segmentation of points: labels carried to the true points, one confusion matrix, the metrics of OVO.
+"""Semantic segmentation of points: labels are transferred to the true points and scored with the metrics of OVO.
 
 Classes are 0 … c - 1; any other number is no class. A confusion matrix is int64 (c, c + 1): rows are true classes,
-columns predicted ones, and the last column counts points without an answer. Matrices of several scenes are added.
+columns predicted ones, the last column is no answer. Matrices of several scenes are added.
 """
 
 from collections.abc import Collection, Sequence
@@ -19,13 +19,12 @@ from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.geometry import rotated
 from emgs_jax.io.ply_reader import read_vertices
 
-_VOTED_ROWS = 200_000  # points that are given a class together: bounds the memory, does not change the result
-_MERGE_ROWS = 1_000_000  # fewest pending rows that are merged: bounds the memory, does not change the result
+_VOTED_ROWS, _MERGE_ROWS = 200_000, 1_000_000  # points that vote, rows that are merged at a time; bound the memory
 
 
 @dataclass(frozen=True)
 class LabelledPoints:
-    """Points with a class each."""
+    """Points and their classes."""
 
     points: np.ndarray  # (n, 3), metres
     labels: np.ndarray  # (n,), position in `classes`; any other number is no class
@@ -33,14 +32,11 @@ class LabelledPoints:
 
 
 class TrueLabels:
-    """The true classes in the voxels [m] of the world that labelled frames see, each pair once.
-
-    It grows with what is seen, not with the frames.
-    """
+    """The true classes in the voxels [m] that labelled frames see; grows with what is seen, not with the frames."""
 
     def __init__(self, dataset: Dataset, voxel: float, max_depth: float) -> None:
         self._dataset, self._voxel, self._max_depth = dataset, voxel, max_depth
-        self._rows = [np.empty((0, 2), np.int64)]  # a class and a cell's number, by cell; the first is what was merged
+        self._rows = [np.empty((0, 2), np.int64)]  # distinct classes and cell numbers, by cell; the first is merged
 
     def append(self, frame: Frame) -> None:
         """Add what a frame sees."""
@@ -55,7 +51,7 @@ class TrueLabels:
             self._rows = [_distinct(np.concatenate(self._rows))]
 
     def points(self) -> LabelledPoints | None:
-        """A point for every class that is seen in a voxel: its centre; None where nothing is seen."""
+        """The centre of a voxel for each class that is seen in it; None if nothing is seen."""
         rows = _distinct(np.concatenate(self._rows))
         if not len(rows):
             return None
@@ -68,7 +64,7 @@ def align_labels(
     poses: tuple[np.ndarray, np.ndarray],
     config: EvaluationConfig,
 ) -> LabelledPoints:
-    """Bring points with classes into the frame of the truth, as `align_points` does."""
+    """Move points with classes into the truth's frame, as `align_points` does."""
     if isinstance(labels, SpooledLabels):
         alignment, _ = align_poses(*poses, with_scale=config.alignment == "sim3")
         labels = labels.points(own_voxel(alignment, config))
@@ -76,45 +72,39 @@ def align_labels(
 
 
 def compare_labels(found: LabelledPoints, truth: LabelledPoints, num_neighbours: int) -> dict[str, float | int | None]:
-    """Segmentation metrics of points in the frame of the truth; classes are the same where their names are."""
+    """Segmentation metrics of points in the truth's frame; classes are matched by name."""
     labels = translate(found.labels, found.classes, truth.classes)
     predicted = transfer_labels(found.points, labels, truth.points, num_neighbours)
     return segmentation_metrics(confusion_matrix(truth.labels, predicted, len(truth.classes)))
 
 
 def translate(labels: np.ndarray, classes: Sequence[str], others: Sequence[str]) -> np.ndarray:
-    """Labels of `classes` as positions in `others`, where names are the same; -1 stays.
-
-    A class that the others do not have becomes their number, an answer that is wrong and not one that is missing.
-    """
+    """Translate labels of `classes` into those of `others` by name; a missing name becomes len(others), -1 stays."""
     number = {name: position for position, name in enumerate(others)}
     positions = np.array([number.get(name, len(number)) for name in classes] + [-1], np.int64)
     return positions[np.where(labels >= 0, labels, -1)]
 
 
 def nearest_classes(features: np.ndarray, text_features: np.ndarray) -> np.ndarray:
-    """Class whose embedding (c, f) is nearest to each feature (…, f) by angle; -1 for a feature of zero."""
+    """The class whose embedding (c, f) is nearest by angle to each feature (…, f); -1 for a feature of zero."""
     length = np.linalg.norm(text_features, axis=1, keepdims=True)
     scores = features.astype(np.float32) @ (text_features / np.maximum(length, 1e-12)).T.astype(np.float32)
     return np.where(features.any(-1), scores.argmax(-1), -1)
 
 
 class SpooledLabels:
-    """The points of many views with their classes, as `SpooledRows` (n, 4) of float32: x, y, z and the class."""
+    """Points of many views with their classes, as `SpooledRows` (n, 4): x, y, z, class."""
 
     def __init__(self, classes: Sequence[str]) -> None:
         self._rows, self._classes = SpooledRows(), tuple(classes)
 
     def append(self, points: np.ndarray, labels: np.ndarray) -> None:
-        """Add a view: points (n, 3) and their classes (n,); what has none or is not finite is left out."""
+        """Add the points (n, 3) of a view that are finite and have a class in labels (n,)."""
         known = labels >= 0
         self._rows.append(np.column_stack([points[known], labels[known]]))
 
     def points(self, voxel: float) -> LabelledPoints:
-        """The centre of every voxel [lengths of the points] with the class of most views.
-
-        A view counts once in a voxel; of equally frequent classes it is the first.
-        """
+        """The centre of every voxel with the class of most views, of equally frequent ones the first."""
 
         def read(view: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
             pairs = _distinct(np.column_stack([view[:, 3].astype(np.int64), cell_numbers(view[:, :3], voxel)]))
@@ -126,7 +116,7 @@ class SpooledLabels:
 
 
 def most_seen(rows: np.ndarray) -> np.ndarray:
-    """The most frequent label of each cell, of equally frequent ones the first; rows (n, 2) of a label and a cell."""
+    """The most frequent label of each cell, of equally frequent ones the first, from rows (n, 2) of label and cell."""
     rows = rows[np.lexsort(rows.T)]
     begins = np.flatnonzero((np.diff(rows, axis=0, prepend=-1) != 0).any(1))
     pairs, views = rows[begins], np.diff(begins, append=len(rows))
@@ -135,9 +125,9 @@ def most_seen(rows: np.ndarray) -> np.ndarray:
 
 
 def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray, num_neighbours: int) -> np.ndarray:
-    """Most frequent label among the nearest points of each target (m, 3); of equally frequent ones the smallest.
+    """The most frequent label, of equal ones the smallest, among the nearest points of each target (m, 3); -1 without.
 
-    Points (n, 3) whose label is negative are left out, as OVO does; without any other every target gets -1.
+    Points (n, 3) with a negative label are left out, as OVO does.
     """
     known = labels >= 0
     points, labels = points[known], labels[known].astype(np.int64)
@@ -153,7 +143,7 @@ def transfer_labels(points: np.ndarray, labels: np.ndarray, targets: np.ndarray,
 
 
 def confusion_matrix(truth: np.ndarray, predicted: np.ndarray, num_classes: int) -> np.ndarray:
-    """Count the pairs of true and predicted class (n,); rows without a true class do not count."""
+    """Count pairs of true and predicted class (n,), where there is a true class."""
     if truth.shape != predicted.shape:
         raise ValueError(f"truth {truth.shape} and predicted {predicted.shape} must match: transfer the labels first")
     counted = (truth >= 0) & (truth < num_classes)
@@ -164,11 +154,10 @@ def confusion_matrix(truth: np.ndarray, predicted: np.ndarray, num_classes: int)
 
 
 def segmentation_metrics(confusion: np.ndarray, ignored: Collection[int] = ()) -> dict[str, float | int | None]:
-    """Metrics of OVO's `run_eval.py` in percent, and the share of points that are right; None without any true class.
+    """Metrics of OVO's `run_eval.py` in percent, and the share of right points; None without any true class.
 
-    A class counts if it is true or predicted anywhere; one that is only predicted has IoU 0 and recall 0.
-    f-mIoU weights the IoU by the number of true points. Of `ignored` classes the true points do not count;
-    a point that is wrongly given to one is a miss.
+    A class counts if it is true or predicted anywhere; one that is only predicted has IoU 0 and recall 0. f-mIoU is
+    weighted by the number of true points. True points of `ignored` classes do not count; predicting one is a miss.
     """
     num_classes = len(confusion)
     confusion = confusion.copy()
@@ -187,13 +176,13 @@ def segmentation_metrics(confusion: np.ndarray, ignored: Collection[int] = ()) -
 
 
 def _distinct(rows: np.ndarray) -> np.ndarray:
-    """Each row (n, 2) once, ordered by the second column; as `np.unique` along an axis, in a fifth of its time."""
+    """Distinct rows (n, 2), sorted by the second column, in a fifth of the time of `np.unique`."""
     rows = rows[np.lexsort(rows.T)]
     return rows[(np.diff(rows, axis=0, prepend=-1) != 0).any(1)]
 
 
 def read_labelled_mesh(folder: Path, scene: str, classes: ClassFile) -> LabelledPoints:
-    """The vertices of a scene with their classes, -1 = none; ValueError where its files are missing or do not fit."""
+    """Read a scene's vertices and their classes, -1 = none; ValueError if its files are missing or do not fit."""
     mesh, labels = folder / f"{scene}_mesh.ply", folder / f"{scene}.txt"
     missing = [path.name for path in (mesh, labels) if not path.is_file()]
     if missing:

@@ -1,29 +1,27 @@
-"""Errors of an estimated trajectory against the true one: association, alignment, absolute and relative errors.
+"""Compare an estimated trajectory with the true one: association, alignment, absolute and relative errors (RMS).
 
-All errors are root mean squares. Poses are `T_world_camera`, float (n, 4, 4), in metres.
+Poses are `T_world_camera`, float (n, 4, 4), in metres.
 """
 
 import numpy as np
 
 from emgs_jax.data.pose_conventions import EXPECTED, READINGS
-from emgs_jax.data.timestamps import resolution
+from emgs_jax.data.timestamps import nearest_rows, resolution
 from emgs_jax.geometry import Sim3, pose_difference
 
-MIN_ODD_DEG, MIN_GAIN = 1.0, 3.0  # rotation per motion, and by which factor another convention must fit better
-_MAX_ROLL_STD = 0.25  # rad, of the roll about a path by its positions, above which orientations know it better
-_MIN_SPREAD_M = 1e-6  # below this RMS distance from its centroid a path gives no direction and no scale
+MIN_ODD_DEG, MIN_GAIN = 1.0, 3.0  # rotation per motion, and factor by which another convention must fit better
+_MAX_ROLL_STD = 0.25  # rad; above, orientations determine the roll about a path better than its positions
+_MIN_SPREAD_M = 1e-6  # RMS distance from its centroid below which a path has no direction and no scale
 
 
 class DegenerateTrajectoryError(ValueError):
-    """The positions do not determine the alignment that was asked for."""
+    """The positions do not determine the alignment."""
 
 
 def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -> tuple[np.ndarray, np.ndarray]:
-    """Pair timestamps (n,) and (m,), in seconds, that are each other's nearest within `max_difference`.
+    """Pair timestamps (n,) and (m,), in seconds, that are each other's nearest within `max_difference` and rounding.
 
-    Times that differ by it are within it, however float64 rounds them: seconds since 1970 by 2e-7.
-
-    Returns indices into a and into b, int (k,), in the order of a; no index occurs twice.
+    Returns indices into a and into b, int (k,), in the order of a; none occurs twice.
     """
     times_a, times_b = np.asarray(times_a, np.float64), np.asarray(times_b, np.float64)
     if not len(times_a) or not len(times_b):
@@ -35,10 +33,10 @@ def associate(times_a: np.ndarray, times_b: np.ndarray, max_difference: float) -
 
 
 def align(estimate: np.ndarray, reference: np.ndarray, with_scale: bool) -> Sim3:
-    """Find the least-squares similarity (Umeyama 1991) from points (n, 3) to their partners (n, 3).
+    """Find the least-squares similarity, or rigid motion, from points (n, 3) to their partners (Umeyama 1991).
 
-    Without scale it is the best rigid motion. Of a straight path the roll about the line is arbitrary (the residual
-    is not); `align_poses` takes it from the orientations. Raises DegenerateTrajectoryError.
+    The roll about a straight path is arbitrary; `align_poses` takes it from the orientations. Raises
+    DegenerateTrajectoryError.
     """
     estimate, reference = _checked(estimate, reference, 3)
     for name, points in (("estimate", estimate), ("reference", reference)):
@@ -48,11 +46,10 @@ def align(estimate: np.ndarray, reference: np.ndarray, with_scale: bool) -> Sim3
 
 
 def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tuple[Sim3, str | None]:
-    """Align poses (n, 4, 4) by their positions, and by their orientations where positions leave something open.
+    """Align poses (n, 4, 4) by their positions, or by their orientations where positions leave something open.
 
-    Unlike `align` this answers for every sequence of at least one pose: on a straight path the orientations decide
-    the roll; without motion, or with fewer than 3 poses, they decide the rotation and the scale stays 1. The second
-    value says so, None in the regular case.
+    On a straight path the orientations determine the roll; without motion, or with fewer than 3 poses, they determine
+    the rotation, and the scale is 1. The second value notes that; None in the regular case.
     """
     x, y = _checked(np.asarray(estimate)[:, :3, 3], np.asarray(truth)[:, :3, 3], 1)
     orientations = np.einsum("nij,nkj->ik", np.asarray(truth)[:, :3, :3], np.asarray(estimate)[:, :3, :3]) / len(x)
@@ -61,32 +58,29 @@ def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tu
     covariance = _covariance(x, y)
     u, singular, vt = np.linalg.svd(covariance)
     found = _solve(x, y, covariance, with_scale)
-    # n positions of error σ hold the roll about their line to σ / (w √n), w being how wide they lie beside it.
+    # n positions of error σ determine the roll about their line to σ / (w √n), where w is their spread beside it.
     least = ate(x, y, found) ** 2 / (len(x) * _MAX_ROLL_STD**2)
     if singular[1] > max(1e-6 * singular[0], least):
         return found, None
-    # What is beside the line is noise. A term too small to turn the line itself is the only one that sees the roll.
+    # The spread beside the line is noise. A term too small to turn the line determines the roll.
     line = singular[0] * np.outer(u[:, 0], vt[0])
     rotation = _solve(x, y, line + 1e-5 * singular[0] * orientations, False).rotation
     return _solve(x, y, covariance, with_scale, rotation), "straight path: roll about it aligned by orientation"
 
 
 def ate(estimate: np.ndarray, reference: np.ndarray, alignment: Sim3) -> float:
-    """Root mean square distance [m] of the aligned positions (n, 3) from the reference (n, 3)."""
+    """RMS distance [m] of the aligned positions (n, 3) from the reference (n, 3)."""
     return _rms(np.linalg.norm(alignment.apply(estimate) - reference, axis=-1))
 
 
 def rpe(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """Error of the motion from each pose to the next: RMS translation [m] and RMS rotation [deg].
-
-    The estimate's own scale is kept: this is what an odometry user gets.
-    """
+    """RMS translation [m] and rotation [deg] of the error from each pose to the next, at the estimate's own scale."""
     distances, angles = pose_difference(*(np.linalg.inv(path[:-1]) @ path[1:] for path in (truth, estimate)))
     return _rms(distances), _rms(angles)
 
 
 def trajectory_metrics(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float | int | str | None]:
-    """Compare poses (n, 4, 4) row by row; flat keys. What is not defined is None and `trajectory/reason` says why."""
+    """Compare poses (n, 4, 4) row by row; flat keys; None where undefined, with `trajectory/reason`."""
     estimate, truth = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
     if estimate.shape != truth.shape or estimate.shape[1:] != (4, 4):
         raise ValueError(f"poses must be two equal (n, 4, 4), got {estimate.shape} and {truth.shape}: associate first")
@@ -110,7 +104,7 @@ def trajectory_metrics(estimate: np.ndarray, truth: np.ndarray) -> dict[str, flo
 
 
 def check_conventions(estimate: np.ndarray, truth: np.ndarray, source: str) -> None:
-    """ValueError where poses (n, 4, 4) turn as the true ones in another convention, and far from that as they are."""
+    """Raise ValueError if poses (n, 4, 4) turn like the true ones in another convention, and not as they are."""
     if len(estimate) < 3:
         return
     own = rpe(estimate, truth)[1]
@@ -126,7 +120,7 @@ def check_conventions(estimate: np.ndarray, truth: np.ndarray, source: str) -> N
 def _solve(
     x: np.ndarray, y: np.ndarray, covariance: np.ndarray, with_scale: bool, rotation: np.ndarray | None = None
 ) -> Sim3:
-    """Solve for the rotation (unless given) that maximises trace(Rᵀ · covariance), then scale, then translation."""
+    """Solve for the rotation that maximises trace(Rᵀ · covariance), unless it is given, then scale and translation."""
     if rotation is None:
         u, _, vt = np.linalg.svd(covariance)
         signs = np.array([1.0, 1.0, 1.0 if np.linalg.det(u @ vt) > 0 else -1.0])  # never a reflection
@@ -151,12 +145,9 @@ def _covariance(x: np.ndarray, y: np.ndarray) -> np.ndarray:
 
 
 def _nearest(queries: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Index of the value nearest to each query; the earlier in time wins a tie."""
+    """Index of the value nearest to each query; the smaller wins a tie."""
     order = np.argsort(values, kind="stable")
-    after = np.searchsorted(values[order], queries).clip(1, max(len(values) - 1, 1))
-    before = order[after - 1]
-    after = order[after.clip(max=len(values) - 1)]
-    return np.where(queries - values[before] <= values[after] - queries, before, after)
+    return order[nearest_rows(queries, values[order], np.inf)]
 
 
 def _spread(points: np.ndarray) -> float:

@@ -1,4 +1,4 @@
-"""Base of a feature model: unit vectors of the cells of an image, in the space of its text embeddings."""
+"""Interface of a feature model: unit vectors for the cells of an image, in the space of its text embeddings."""
 
 import abc
 from functools import cached_property
@@ -10,19 +10,16 @@ from emgs_jax.features.text import TextEmbeddings, load_text
 
 
 class FeatureModel(abc.ABC):
-    """Anything that describes the parts of an image by vectors that text can be compared with.
+    """Describes parts of an image by vectors that text can be compared with; loads weights when first needed."""
 
-    Construction checks what it can without reading weights; they are loaded when they are first needed.
-    """
-
-    identity: dict  # of the space: embeddings of another model must not be compared with its features
-    settings: dict  # what else the features depend on, for provenance; plain JSON values
+    identity: dict  # of the vector space: features are compared only with embeddings of the same identity
+    settings: dict  # what else the features depend on, for provenance; JSON values
     _classes: tuple[str, ...]  # names to embed, or to choose from the file
-    _file: str | None  # of `experiments.embed`; with it no text encoder is needed
+    _file: str | None  # of `experiments.embed`, in place of a text encoder
 
     @cached_property
     def text(self) -> TextEmbeddings:
-        """The classes, from the text encoder or from the file."""
+        """The classes' embeddings, from the text encoder or from the file."""
         return self.embed(self._classes) if self._file is None else load_text(self._file, self.identity, self._classes)
 
     @abc.abstractmethod
@@ -30,8 +27,8 @@ class FeatureModel(abc.ABC):
         """Embed the names with the text encoder."""
 
     def check(self, dataset: Dataset) -> None:  # noqa: B027
-        """Raise ValueError where it cannot describe the frames of the data set; here all that is needed are images."""
+        """Raise ValueError if the model cannot describe the frames of the data set."""
 
     @abc.abstractmethod
     def extract(self, frame: Frame) -> np.ndarray:
-        """Return features (y, x, f), float16, unit or zero, of a grid of cells that cover the frame's image."""
+        """Features (y, x, f), float16, unit or zero, of a grid of cells that cover the image."""

@@ -1,4 +1,4 @@
-"""Folders of weights: what must be in them, and reading them without running any code that is in them."""
+"""Folders of weights: check that files are there, and read them without running code."""
 
 import hashlib
 from collections.abc import Sequence
@@ -24,7 +24,7 @@ class DinoFiles:
 
 
 def require(folder: str, names: Sequence[str], source: str) -> list[Path]:
-    """Return the paths of `names` in `folder`; raise ValueError that names those which are not there."""
+    """The paths of `names` in `folder`; ValueError if some are missing."""
     path = Path(folder).expanduser()
     missing = [name for name in dict.fromkeys(names) if not (path / name).is_file()]
     if missing:
@@ -36,19 +36,13 @@ def require(folder: str, names: Sequence[str], source: str) -> list[Path]:
 
 
 def digest(path: Path) -> str:
-    """Return the SHA-256 of a file."""
+    """The SHA-256 of a file."""
     with open(path, "rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 
 
 def load_part(path: Path, prefix: str, needed: str) -> dict[str, "Tensor"]:
-    """Return the float32 weights under `prefix` by the names after it; all of the file where it holds that part only.
-
-    Args:
-        path: a .pth file; only tensors are read from it, no code is run.
-        prefix: of the part in a file of the whole model.
-        needed: a name without which the file is another one.
-    """
+    """Load float32 weights of a .pth file, those under `prefix` if it holds more; ValueError if `needed` is missing."""
     import torch
 
     try:

@@ -1,8 +1,7 @@
-"""dino.txt on a DINO backbone: patch features that text can be compared with. PyTorch is imported when one is made.
+"""dino.txt on a DINO backbone: patch features that text can be compared with. Nothing is downloaded.
 
-The backbone is Hugging Face's model of the checkpoint. Its own patch tokens are not aligned with text; those of
-dino.txt's vision head are, and their counterpart is the second half of the text encoder's vector, the first half being
-that of the class token. Nothing is ever downloaded.
+The patch tokens of the backbone are not aligned with text; those of dino.txt's vision head are, with the second half of
+the text encoder's vector. The first half belongs to the class token.
 """
 
 import importlib.util
@@ -31,15 +30,14 @@ class DinoText(FeatureModel):
     """Text-aligned patch features of dino.txt.
 
     Args:
-        name: of the model, for provenance: embeddings of another name are refused.
-        checkpoint: folder of the weights.
-        files: names of the files in it.
-        num_registers: of the backbone, which dino.txt was trained on.
+        name: of the model; embeddings of another name are refused.
+        checkpoint: folder of the weights, `files` the names in it.
+        num_registers: of the backbone that dino.txt was trained on.
         num_text_heads: of the text encoder's attention.
-        device: of PyTorch; None = a GPU if there is one.
+        device: of PyTorch; None: a GPU if there is one.
         classes: names to embed, or to choose from `text`.
         templates: prompts over which an embedding is the mean.
-        text: file of `experiments.embed`; with it the text encoder and the vocabulary are not needed.
+        text: file of `experiments.embed`, in place of text encoder and vocabulary.
     """
 
     def __init__(
@@ -80,7 +78,7 @@ class DinoText(FeatureModel):
         return {"backbone": digest(self._paths(*needed)[1]), "image": image}
 
     def embed(self, names: tuple[str, ...]) -> TextEmbeddings:
-        """Encode the prompts of each name and average the half that is aligned with patches."""
+        """Encode the prompts of each name; the mean of the half that is aligned with patches."""
         import torch
 
         if not names:
@@ -102,7 +100,7 @@ class DinoText(FeatureModel):
         return TextEmbeddings(tuple(names), vectors, self._templates, self.identity)
 
     def extract(self, frame: Frame) -> np.ndarray:
-        """Return the unit tokens of the vision head, float16 (rows, columns, f): one cell per patch."""
+        """The unit tokens of the vision head, float16 (rows, columns, f), one per patch."""
         import torch
 
         image = frame.image
@@ -141,14 +139,7 @@ class DinoText(FeatureModel):
 
 
 def read_backbone(folder: Path, source: str) -> Any:
-    """Hugging Face's model of a folder with exactly the weights in it.
-
-    Args:
-        folder: has config.json and model.safetensors.
-
-    Raises:
-        ValueError: the files are damaged or not of one model, or transformers cannot be imported.
-    """
+    """Load Hugging Face's model; ValueError if its files are damaged or do not fit, or transformers does not load."""
     import transformers
 
     remedy = f"fetch config.json and model.safetensors again, from {source}"
@@ -174,12 +165,7 @@ def read_backbone(folder: Path, source: str) -> Any:
 
 
 def patch_grid(tokens: "Tensor", grid: tuple[int, int]) -> "Tensor":
-    """Return the unit patch tokens (rows, columns, d) of one image; those of class and registers stand before them.
-
-    Args:
-        tokens: (1, n, d), patches row by row.
-        grid: (columns, rows).
-    """
+    """The unit patch tokens (rows, columns, d) of tokens (1, n, d), in which class token and registers come first."""
     columns, rows = grid
     patches = tokens[0, -rows * columns :].float()
     return (patches / patches.norm(dim=-1, keepdim=True)).reshape(rows, columns, -1)

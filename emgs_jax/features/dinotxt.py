@@ -1,6 +1,6 @@
-"""The two parts that dino.txt adds to a DINO backbone, as functions of their published weights (PyTorch tensors).
+"""The two transformers that dino.txt adds to a DINO backbone, as functions of their published weights.
 
-Both are pre-norm transformers. `weights` maps names within the part, such as `blocks.0.norm1.weight`, to tensors.
+`weights` maps names within the part, such as `blocks.0.norm1.weight`, to PyTorch tensors. Both are pre-norm.
 """
 
 from collections.abc import Mapping
@@ -13,12 +13,7 @@ Weights = Mapping[str, "Tensor"]
 
 
 def vision_head(tokens: "Tensor", weights: Weights, num_heads: int) -> "Tensor":
-    """Align a backbone's tokens with text: blocks without positions, SwiGLU, layer scale, and a final norm.
-
-    Args:
-        tokens: class token, registers and patches after the backbone's norm (b, n, d).
-        weights: `blocks.{i}.{norm1, attn, ls1, norm2, mlp, ls2}…` and `ln_final…`.
-    """
+    """Align a backbone's normed tokens (b, n, d) with text: blocks without positions, SwiGLU, layer scale, a norm."""
     from torch.nn.functional import silu
 
     for block in _blocks(weights):
@@ -31,13 +26,7 @@ def vision_head(tokens: "Tensor", weights: Weights, num_heads: int) -> "Tensor":
 
 
 def text_tower(tokens: "Tensor", weights: Weights, num_heads: int) -> "Tensor":
-    """Encode texts (t, n) to vectors (t, 2 d): causal blocks, the state at the end token, which has the largest number.
-
-    Args:
-        tokens: of `Tokenizer`.
-        weights: `backbone.{token_embedding, positional_embedding, blocks.{i}…, ln_final}…` and
-            `head.linear_projection.weight`.
-    """
+    """Encode tokens (t, n) of `Tokenizer` as vectors (t, 2 d): causal blocks, the state at the largest (end) token."""
     from torch.nn.functional import gelu
 
     backbone = _part(weights, "backbone.")

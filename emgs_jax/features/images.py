@@ -1,4 +1,4 @@
-"""From an image of any size to what a vision transformer sees: whole patches, normalised colours."""
+"""Prepare an image for a vision transformer: whole patches, normalised colours."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -20,7 +20,7 @@ class ImageConfig:
 
 
 def grid_size(size: tuple[int, int], patch: int, long_side: int) -> tuple[int, int]:
-    """Return (columns, rows) of patches for an image of `size` (width, height), nearest to its aspect ratio."""
+    """(columns, rows) of patches for an image of `size` (width, height), nearest to its aspect ratio."""
     if long_side < patch or long_side % patch:
         raise ValueError(
             f"features.image.long_side must be a multiple of the network's patch, {patch}; got {long_side}"
@@ -30,17 +30,11 @@ def grid_size(size: tuple[int, int], patch: int, long_side: int) -> tuple[int, i
 
 
 def network_input(image: np.ndarray, grid: tuple[int, int], patch: int, config: ImageConfig) -> np.ndarray:
-    """Return normalised colours, float32 (3, rows·patch, columns·patch), of the whole RGB `image` (h, w, 3), uint8.
-
-    Args:
-        image: RGB.
-        grid: (columns, rows) of patches.
-        patch: pixels a side.
-    """
+    """Normalised colours, float32 (3, rows·patch, columns·patch), of an RGB image (h, w, 3), uint8."""
     size = (grid[0] * patch, grid[1] * patch)
     is_smaller = size[0] < image.shape[1]
     values = image.astype(np.float32) / np.float32(255)
-    # A cubic overshoots at edges, and no camera gives a colour outside of [0, 1].
+    # Cubic interpolation overshoots at edges.
     resized = cv2.resize(values, size, interpolation=cv2.INTER_AREA if is_smaller else cv2.INTER_CUBIC).clip(0, 1)
     normalised = (resized - np.asarray(config.mean, np.float32)) / np.asarray(config.std, np.float32)
     return np.ascontiguousarray(normalised.transpose(2, 0, 1))

@@ -1,4 +1,4 @@
-"""Features from the class images of any segmentation network: each class has a direction of its own."""
+"""Features from the class images of any segmentation network: each class has a vector."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -19,17 +19,13 @@ MAX_ENLARGED = 32  # times; a network gives a class for each of its patches at l
 
 
 class LabelFeatures(FeatureModel):
-    """Reads what a segmenter said of each image.
-
-    A pixel's feature is the vector of its class, or where there are scores the mean of all classes' vectors under them,
-    unit length again. Without a file of embeddings each class has an axis of its own: all are equally far apart, and
-    their mean over many views holds the shares of the views.
+    """Reads the classes of each image: a pixel has the vector of its class, or with scores their unit weighted mean.
 
     Args:
-        folder: STEM.png with class ids (see `LabelFolder`), or STEM.npy with scores (h, w, classes), at least 0, in
-            the order of `names`, for every image STEM.* of the data set.
+        folder: for every image STEM.* STEM.png with class ids (see `LabelFolder`), or STEM.npy with scores of at least
+            0, (h, w, classes), in the order of `names`.
         unknown: ids that mean no class, see `LabelFolder`.
-        text: file of `experiments.embed` with the names' embeddings; None = the axes.
+        text: file of `experiments.embed` with the names' embeddings; None: each class has an axis of its own.
     """
 
     def __init__(self, folder: str, names: str, unknown: Sequence[int] | None = None, text: str | None = None) -> None:
@@ -49,25 +45,21 @@ class LabelFeatures(FeatureModel):
             model = {"name": "labels", "version": 1, "classes": [*names]}
             return TextEmbeddings(names, np.eye(len(names), dtype=np.float32), (), model)
         found = read_text(self._file)
-        rows = {name: row for row, name in enumerate(found.names)}
-        missing = [name for name in names if name not in rows]
-        if missing:
+        if missing := found.missing(names):
             raise ValueError(
                 f"features.text={self._file} has no embedding of {missing[:5]} of {self._names_file}: write it with "
                 "`python -m experiments.embed` for these names"
             )
-        return TextEmbeddings(names, found.vectors[[rows[name] for name in names]], found.templates, found.model)
+        return found.only(names)
 
     def embed(self, names: tuple[str, ...]) -> TextEmbeddings:
-        """The vectors of classes of `names`; raises ValueError where one is none of them."""
-        unknown = [name for name in names if name not in self.text.names]
-        if unknown:
+        """The vectors of these classes; ValueError if one has none."""
+        if unknown := self.text.missing(names):
             raise ValueError(f"{unknown} are no classes of {self._names_file}, which has {', '.join(self.text.names)}")
-        rows = [self.text.names.index(name) for name in names]
-        return TextEmbeddings(tuple(names), self.text.vectors[rows], self.text.templates, self.text.model)
+        return self.text.only(names)
 
     def check(self, dataset: Dataset) -> None:
-        """Raise ValueError where a frame has no file, or the images are no longer those that were segmented."""
+        """Raise ValueError if a frame has no file, or the data set straightens the images that were segmented."""
         images = [str(files[0]) for i in range(len(dataset)) if (files := dataset.files(i))]
         missing = [name for name in images if not self._file_of(name).is_file()]
         if missing:
@@ -88,7 +80,7 @@ class LabelFeatures(FeatureModel):
             )
 
     def extract(self, frame: Frame) -> np.ndarray:
-        """Features (h, w, f), float16, at the frame's size; zero where there is no class."""
+        """Features (h, w, f), float16, at the frame's size; zero without a class."""
         path = self._file_of(frame.name)
         vectors, size = self.text.vectors, frame.image.shape[1::-1]
         if path.suffix == ".npy":
@@ -108,7 +100,7 @@ class LabelFeatures(FeatureModel):
 
 
 def _check_shape(found: tuple[int, int], size: tuple[int, int], path: Path) -> None:
-    """BadFrameError where labels are not of the shape of the image; half a pixel of a smaller side may be cut."""
+    """Raise BadFrameError if labels have not the aspect of the image, up to half a pixel, or are too coarse."""
     (w, h), (width, height) = found, size
     if abs(w * height - h * width) > max(w, h, width, height):
         raise BadFrameError(
@@ -119,7 +111,7 @@ def _check_shape(found: tuple[int, int], size: tuple[int, int], path: Path) -> N
 
 
 def _resize_scores(scores: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-    """Scores (h, w, c) at another (width, height); OpenCV takes so many channels at once and drops a single one."""
+    """Resize scores (h, w, c), as many channels at once as OpenCV takes; it drops the axis of a single one."""
     parts = np.split(scores, range(MAX_CHANNELS, scores.shape[2], MAX_CHANNELS), axis=-1)
     resized = [cv2.resize(part, size, interpolation=cv2.INTER_AREA).reshape(*size[::-1], -1) for part in parts]
     return np.concatenate(resized, axis=-1)
@@ -127,7 +119,7 @@ def _resize_scores(scores: np.ndarray, size: tuple[int, int]) -> np.ndarray:
 
 def _read_scores(path: Path, num_classes: int) -> np.ndarray:
     try:
-        # Mapped, so that a header which announces more than there is is an error and not a large array.
+        # Mapped, so that a header that announces too much is an error and not a large array.
         scores = np.lib.format.open_memmap(path, mode="r")
     except (ValueError, OSError, EOFError) as error:
         raise BadFrameError(f"{path} is no array of scores, or damaged ({error}): write it again") from error

@@ -1,4 +1,4 @@
-"""Features without weights, for tests: a fixed random projection of local colours, and random text embeddings."""
+"""Features without weights, for tests: a random projection of local colours, and random text embeddings."""
 
 from collections.abc import Sequence
 
@@ -11,12 +11,7 @@ from emgs_jax.features.text import TextEmbeddings, average_over_templates, check
 
 
 class RandomFeatures(FeatureModel):
-    """Project the mean colour of each cell. The text embeddings say nothing of colours.
-
-    Args:
-        cell: pixels a side.
-        text: file of `experiments.embed` to take the embeddings from; None makes them.
-    """
+    """Projects the mean colour of each cell of `cell` pixels a side; text embeddings are unrelated to colours."""
 
     def __init__(
         self, width: int, cell: int, seed: int, classes: Sequence[str], templates: Sequence[str], text: str | None
@@ -31,7 +26,7 @@ class RandomFeatures(FeatureModel):
         self.settings = {"cell": cell}
 
     def embed(self, names: tuple[str, ...]) -> TextEmbeddings:
-        """Return pseudo-random vectors that depend on the prompts only."""
+        """Pseudo-random vectors that depend on the prompts only."""
         vectors = np.zeros((0, self._width), np.float32)
         if names:
             encode = lambda prompts: random_embeddings(prompts, self._width)  # noqa: E731
@@ -39,11 +34,11 @@ class RandomFeatures(FeatureModel):
         return TextEmbeddings(tuple(names), vectors, self._templates, self.identity)
 
     def extract(self, frame: Frame) -> np.ndarray:
-        """Return the unit projection of (r, g, b, 1) of each cell's mean colour in [0, 1], float16 (y, x, f)."""
+        """The unit projection of (r, g, b, 1) of each cell's mean colour in [0, 1], float16 (y, x, f)."""
         image = frame.image
         height, width = image.shape[:2]
         cells = max(round(width / self._cell), 1), max(round(height / self._cell), 1)
         colors = cv2.resize(image.astype(np.float32) / np.float32(255), cells, interpolation=cv2.INTER_AREA)
-        # einsum and not @: its sums do not depend on the number of BLAS threads, and the bits must not either.
+        # einsum and not @, whose sums depend on the number of BLAS threads.
         features = np.einsum("yxc,fc->yxf", colors, self._projection[:, :3]) + self._projection[:, 3]
         return (features / np.linalg.norm(features, axis=-1, keepdims=True)).astype(np.float16)

@@ -1,7 +1,6 @@
-"""Text to token numbers as CLIP does it: byte-level pairs, merged in the order of a vocabulary file.
+"""CLIP's tokenizer: byte pairs, merged in the order of a vocabulary file.
 
-CLIP cleans its text with ftfy first. What of that matters for names is done here: characters are composed, and quotes
-are straight.
+Of ftfy, with which CLIP cleans its text first, names need composed characters and straight quotes.
 """
 
 import gzip
@@ -16,11 +15,11 @@ END_OF_WORD = "</w>"
 
 
 class Tokenizer:
-    """Numbers of a vocabulary, which has a number per byte, per byte that ends a word, per merge, and two marks.
+    """Tokens of a vocabulary: a number per byte, per byte that ends a word, per merge, and two marks.
 
     Args:
-        path: CLIP's `bpe_simple_vocab_16e6.txt.gz`: after its first line, one pair a line, most frequent first.
-        num_tokens: size of the text model's table; it says how many pairs of the file are in use.
+        path: CLIP's `bpe_simple_vocab_16e6.txt.gz`: after its first line a pair a line, most frequent first.
+        num_tokens: size of the text model's table, which tells how many pairs are in use.
     """
 
     def __init__(self, path: Path, num_tokens: int, length: int) -> None:
@@ -41,7 +40,7 @@ class Tokenizer:
         self._start, self._end, self._length = num_tokens - 2, num_tokens - 1, length
 
     def __call__(self, texts: list[str]) -> np.ndarray:
-        """Return int64 (texts, length): start, text, end, zeros; a text that is too long is cut before the end."""
+        """Encode as int64 (texts, length): start, text, end, zeros; a longer text is cut before its end mark."""
         rows = np.zeros((len(texts), self._length), np.int64)
         for row, text in zip(rows, self._pipeline.encode_batch(texts), strict=True):
             numbers = [self._start, *text.ids[: self._length - 2], self._end]
@@ -50,10 +49,7 @@ class Tokenizer:
 
 
 def byte_symbols() -> list[str]:
-    """Return a visible character for every byte, in CLIP's order: printable ones stand for themselves and come first.
-
-    The others are those from 256 on.
-    """
+    """A visible character for every byte, in CLIP's order: printable bytes as themselves, then the others from 256."""
     printable = [*range(33, 127), *range(161, 173), *range(174, 256)]
     return [chr(byte) for byte in printable] + [chr(256 + rank) for rank in range(256 - len(printable))]
 

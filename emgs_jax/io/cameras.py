@@ -1,7 +1,7 @@
-"""Cameras as other programs read them: COLMAP's sparse model, nerfstudio's transforms.json, a mesh of pyramids.
+"""Write cameras for other programs: COLMAP's sparse model, nerfstudio's transforms.json, a mesh of frustums.
 
-Pixels are counted from the image's corner there; ours have their centres at integers. COLMAP's poses are world →
-camera (`data.colmap_model` reads them), nerfstudio's camera → world with OpenGL's axes.
+Both programs count pixels from the image's corner; our pixel centres are integers. COLMAP's poses are world → camera,
+nerfstudio's are camera → world with OpenGL's axes.
 """
 
 import os
@@ -26,13 +26,7 @@ _SMALLEST = 0.05  # metres; depth of a pyramid where the camera hardly moves
 def save_colmap(
     folder: Path, camera: Camera, names: Sequence[str], T_world_camera: Any, points: Any, colors: Any
 ) -> None:
-    """Write cameras.txt, images.txt and points3D.txt of one pinhole camera.
-
-    Args:
-        names: of the image files.
-        T_world_camera: (n, 4, 4), metres.
-        points, colors: (p, 3), metres, world, and RGB, uint8; written without tracks.
-    """
+    """Write cameras.txt, images.txt and points3D.txt: one pinhole camera, poses (n, 4, 4), points (p, 3), uint8 RGB."""
     poses = np.linalg.inv(np.asarray(T_world_camera, np.float64))
     turns = Rotation.from_matrix(poses[:, :3, :3]).as_quat(canonical=True)[:, [3, 0, 1, 2]]
     (fx, fy), (cx, cy) = np.float64(camera.focal), np.float64(camera.center)
@@ -56,13 +50,9 @@ def _words(values: Sequence[float]) -> str:
 def save_transforms(
     path: Path, camera: Camera, names: Sequence[str], T_world_camera: Any, points_file: str, masks: Sequence[str] = ()
 ) -> None:
-    """Write transforms.json of one pinhole camera.
+    """Write transforms.json: one pinhole camera and poses (n, 4, 4) with OpenCV's axes.
 
-    Args:
-        names: of the image files, from the folder of `path`.
-        T_world_camera: (n, 4, 4), OpenCV axes, metres.
-        points_file: a PLY in the same world, from the folder of `path`.
-        masks: of each image, black where it is not to be used, likewise; none for no image.
+    Names of images, of the PLY `points_file` and of masks (one an image, black where unused) are relative to `path`.
     """
     (fx, fy), (cx, cy) = np.float64(camera.focal), np.float64(camera.center)
     known = {"camera_model": "PINHOLE", "w": camera.width, "h": camera.height}
@@ -82,14 +72,12 @@ def save_frustums(
     joined: np.ndarray,
     path_color: np.ndarray,
 ) -> int:
-    """Write cameras and path as coloured triangles; returns how many triangles.
+    """Write frustums and path as coloured triangles; return the number of triangles.
 
     Args:
-        camera: whose pyramids have the images' shape.
-        T_world_camera: (n, 4, 4), metres.
-        colors: (n, 3), RGB in [0, 1], of each camera.
-        joined: (n - 1,), whether the path goes from each camera to the next.
-        path_color: (3,).
+        T_world_camera: (n, 4, 4).
+        colors: (n, 3), RGB in [0, 1] of each camera; `path_color` (3,) likewise.
+        joined: (n - 1,), True where the path connects a camera to the next.
     """
     centers = T_world_camera[:, :3, 3]
     depth = max(_SHARE * float(np.linalg.norm(np.ptp(centers, axis=0))), _SMALLEST)
@@ -110,7 +98,7 @@ def save_frustums(
 
 
 def _bars(first: np.ndarray, last: np.ndarray, radius: float) -> np.ndarray:
-    """Corners (b, 6, 3) of three-sided bars from `first` to `last` (b, 3): three round each end."""
+    """Corners (b, 6, 3) of three-sided bars from `first` to `last` (b, 3): three around each end."""
     along = last - first
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along = np.where(length > 0, along / np.where(length > 0, length, 1.0), [0.0, 0.0, 1.0])

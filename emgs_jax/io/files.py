@@ -1,4 +1,4 @@
-"""Files that stay valid: whatever interrupts a write, the old content or the complete new one is there."""
+"""Atomic writes: whatever interrupts one, the file holds its old content or all of the new."""
 
 import contextlib
 import dataclasses
@@ -16,10 +16,7 @@ import numpy as np
 
 @contextlib.contextmanager
 def atomic_write(path: str | os.PathLike, mode: str = "wb") -> Iterator[IO]:
-    """Open a temporary file beside `path`; move it to `path` if the block succeeds, else remove it.
-
-    An OSError raised inside (full disk, no permission) is raised again with the name of `path`.
-    """
+    """Open a temporary file, which becomes `path` if the block succeeds; an OSError inside names `path`."""
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
@@ -31,27 +28,23 @@ def atomic_write(path: str | os.PathLike, mode: str = "wb") -> Iterator[IO]:
     except OSError as error:
         raise _named(error, path) from error
     finally:
-        with contextlib.suppress(OSError):  # none is there, or nothing can be removed either
+        with contextlib.suppress(OSError):  # it was moved, or cannot be removed
             temporary.unlink()
 
 
 def write_file(path: str | os.PathLike, content: str | bytes) -> None:
-    """Write a file, whole or not at all."""
+    """Write a file atomically."""
     with atomic_write(path, "w" if isinstance(content, str) else "wb") as handle:
         handle.write(content)
 
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """A folder beside `path` that becomes `path` if the block succeeds, and is removed if it does not.
-
-    Raises:
-        ValueError: there is something at `path`; it stays.
-    """
+    """Make a folder that becomes `path` if the block succeeds, else is removed; ValueError if `path` exists."""
     if path.exists():
         raise ValueError(f"{path} is there already: remove it, or write elsewhere")
     partial = path.with_name(f".{path.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # of a program that was killed
+    shutil.rmtree(partial, ignore_errors=True)  # a killed program may have left it
     try:
         partial.mkdir(parents=True)
         yield partial
@@ -64,12 +57,9 @@ def new_folder(path: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def owned(folder: Path) -> Iterator[None]:
-    """Hold a folder, made here, for this process: of two programs that write into one folder the second is refused.
+    """Make a folder and lock it for this process; ValueError if another program holds the lock.
 
-    The system lets go of it when the process ends, however it does. Where it knows no such locks nothing is refused.
-
-    Raises:
-        ValueError: another program holds it.
+    The system releases the lock when the process ends. Where it has no locks, nothing is refused.
     """
     folder.mkdir(parents=True, exist_ok=True)
     try:
@@ -92,17 +82,14 @@ def owned(folder: Path) -> Iterator[None]:
 
 
 def check_writable(path: Path, what: str) -> None:
-    """Raise ValueError where a folder neither is there to be written into nor can be made; makes none."""
+    """Raise ValueError if a folder can neither be written to nor be made; `what` names it. Makes nothing."""
     nearest = next((place for place in (path, *path.parents) if place.exists()), Path())
     if not (nearest.is_dir() and os.access(nearest, os.W_OK)):
         raise ValueError(f"{what}: {nearest} is no folder that can be written to: choose another one")
 
 
 def remove_temporaries(folder: Path) -> list[str]:
-    """Remove what an `atomic_write` into `folder` left that was killed; returns the names. One process owns a folder.
-
-    A temporary file whose process still runs on this machine is left alone.
-    """
+    """Remove what killed processes left of an `atomic_write` into `folder`; return the names."""
     found = [(path, re.fullmatch(r"\..+\.(\d+)\.tmp(\..*)?", path.name)) for path in sorted(folder.glob(".*.tmp*"))]
     dead = [path for path, name in found if name and not _is_running(int(name[1]))]
     for path in dead:
@@ -116,15 +103,13 @@ def _is_running(process: int) -> bool:
         return True
     try:
         os.kill(process, 0)  # asks only
-    except (ProcessLookupError, OverflowError):
-        return False
-    except PermissionError:
-        return True
+    except (OSError, OverflowError) as error:
+        return isinstance(error, PermissionError)  # another user's
     return True
 
 
 def jsonable(value: Any) -> Any:
-    """Turn arrays, NumPy scalars, paths, dataclasses and mappings into what JSON has; NaN and infinities into None."""
+    """Turn arrays, NumPy scalars, paths, dataclasses and mappings into JSON values; NaN and infinity become None."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {field.name: jsonable(getattr(value, field.name)) for field in dataclasses.fields(value)}
     if isinstance(value, Mapping):
@@ -141,7 +126,7 @@ def jsonable(value: Any) -> Any:
 
 
 def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
-    """Values by dotted key."""
+    """Flatten nested mappings to values by dotted key."""
     values = {}
     for key, value in tree.items():
         values |= flat(value, f"{prefix}{key}.") if isinstance(value, Mapping) else {f"{prefix}{key}": value}
@@ -149,22 +134,19 @@ def flat(tree: Mapping[str, Any], prefix: str = "") -> dict[str, Any]:
 
 
 def changes(before: Mapping[str, Any], now: Mapping[str, Any], but: Collection[str] = ()) -> list[str]:
-    """Say each value in which two trees as JSON has them differ, with its dotted key; those of `but` may."""
+    """Describe each value in which two JSON trees differ, except at the dotted keys `but`."""
     before, now = flat(before), flat(now)
     changed = (key for key in sorted({*before, *now} - {*but}) if before.get(key) != now.get(key))
     return [f"{key} was {before.get(key)!r}, now it is {now.get(key)!r}" for key in changed]
 
 
 def write_json(path: str | os.PathLike, value: Any) -> None:
-    """Write `value` as indented, strictly valid JSON."""
+    """Write `value` as indented, strict JSON."""
     write_file(path, json.dumps(jsonable(value), indent=2, allow_nan=False) + "\n")
 
 
 class FrameLog:
-    """A JSON-lines file with one record per frame, complete after every line; starts empty.
-
-    A line that did not fit on the disk is cut off again, so what is in the file can always be parsed.
-    """
+    """A new JSON-lines file. Every line is complete: one that does not fit on the disk is cut off again."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)

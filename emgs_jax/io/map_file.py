@@ -1,4 +1,4 @@
-"""The map's file: every leaf under its field path, bit for bit, and a header that says what it is."""
+"""map.npz: every array of a map under its field path, bit for bit, and a header."""
 
 import os
 
@@ -13,14 +13,14 @@ MAP_FORMAT, MAP_VERSION, CLASS = "emgs_jax.map", 3, GaussianMap.__name__
 
 
 def save_map(path: str | os.PathLike, map: GaussianMap) -> None:
-    """Write a map as .npz: each array under its field path, and a header; `load_map` reads the same bits."""
+    """Write a map as .npz, which `load_map` reads back bit for bit."""
     arrays = {_name(key): np.asarray(leaf) for key, leaf in jax.tree_util.tree_flatten_with_path(map)[0]}
     header = {"format": MAP_FORMAT, "version": MAP_VERSION, "class": CLASS, "leaves": sorted(arrays), "static": {}}
     save_headed(path, header, arrays)
 
 
 def load_map(path: str | os.PathLike) -> GaussianMap:
-    """Read the map.npz of a run; raises ValueError for a file that is no complete, finite map of this version."""
+    """Read the map.npz of a run; ValueError unless it is a complete, finite map of this version."""
     try:
         _, arrays = load_headed(path, {"format": MAP_FORMAT, "version": MAP_VERSION, "class": CLASS})
     except FileNotFoundError:
@@ -37,7 +37,7 @@ def load_map(path: str | os.PathLike) -> GaussianMap:
 
 
 def check_map(path: str | os.PathLike, map: GaussianMap) -> None:
-    """Raise ValueError where a leaf has not a map's dtype and shape, or is not finite where there is a Gaussian."""
+    """Raise ValueError if an array has the wrong dtype or shape, or holds impossible values of a Gaussian."""
     map = jax.device_get(map)
     valid, features = map.gaussians.valid, map.gaussians.features
     if valid.ndim != 1 or valid.dtype != bool or features.ndim != 2:

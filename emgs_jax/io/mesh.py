@@ -1,4 +1,4 @@
-"""A surface through oriented points: Poisson reconstruction without what it invents, written as PLY."""
+"""Mesh oriented points by Poisson reconstruction, without the surface that it invents."""
 
 import os
 from pathlib import Path
@@ -13,35 +13,31 @@ from emgs_jax.io.ply import structured, with_colors, write_ply
 def save_mesh_ply(
     path: str | os.PathLike, points: Any, normals: Any, colored: tuple[Any, Any], depth: int = 8, min_points: int = 50
 ) -> str | None:
-    """Mesh oriented points (Poisson, trimmed where points are far) and write it; deterministic.
+    """Mesh points (n, 3) with unit normals (n, 3) and write the mesh as PLY; deterministic.
 
     Args:
-        points: (n, 3), with `normals` (n, 3) that are unit.
-        colored: points (m, 3) and their RGB in [0, 1], (m, 3): a vertex has the colour of the nearest one.
+        colored: points (m, 3) and their RGB in [0, 1], (m, 3): a vertex takes the colour of the nearest.
 
-    Returns None, or the reason why there is no mesh; then no file is written and an older one is removed.
+    Returns:
+        None, or why there is no mesh; then an older file is removed.
     """
     points, normals = (np.asarray(value, np.float64) for value in (points, normals))
     keep = np.isfinite(points).all(1) & np.isfinite(normals).all(1) & (np.linalg.norm(normals, axis=1) > 0.5)
     points, normals = points[keep], normals[keep]
-    reason = None
     if len(points) < min_points:
-        reason = f"{len(points)} points with a normal, at least {min_points} are needed for a mesh"
-    else:
-        vertices, faces = poisson(*crop(points, normals), depth)
-        tree = cKDTree(points)
-        vertices, faces = trim(vertices, faces, tree)
-        reason = None if len(faces) else "the surface reconstruction is empty"
-    if reason is not None:
         Path(path).unlink(missing_ok=True)
-        return reason
+        return f"{len(points)} points with a normal, at least {min_points} are needed for a mesh"
+    vertices, faces = trim(*poisson(*crop(points, normals), depth), cKDTree(points))
+    if not len(faces):
+        Path(path).unlink(missing_ok=True)
+        return "the surface reconstruction is empty"
     colors = np.asarray(colored[1])[cKDTree(colored[0]).query(vertices)[1]]
     write_ply(path, with_colors(structured(vertices.astype(np.float32), ["x", "y", "z"]), colors), faces)
     return None
 
 
 def crop(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Leave out far flying points: the solver's grid spans all points, so they would make the cells coarse."""
+    """Leave out far outliers: the solver's grid spans all points, so its cells would be coarse."""
     low, high = np.percentile(points, [1, 99], axis=0)
     margin = 0.25 * np.max(high - low)
     keep = ((points >= low - margin) & (points <= high + margin)).all(1)
@@ -50,7 +46,7 @@ def crop(points: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 def poisson(points: np.ndarray, normals: np.ndarray, depth: int) -> tuple[np.ndarray, np.ndarray]:
     """Vertices (v, 3) and triangles (t, 3) of the surface through points with normals, both (n, 3)."""
-    import open3d as o3d  # slow to import, and only a mesh needs it
+    import open3d as o3d  # slow to import
 
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(points))
     cloud.normals = o3d.utility.Vector3dVector(normals)
@@ -62,7 +58,7 @@ def poisson(points: np.ndarray, normals: np.ndarray, depth: int) -> tuple[np.nda
 
 
 def trim(vertices: np.ndarray, faces: np.ndarray, tree: cKDTree) -> tuple[np.ndarray, np.ndarray]:
-    """Drop the surface that Poisson invents: what is farther from all points than their own spacing explains."""
+    """Drop the surface that is farther from all points than their spacing explains."""
     spacing = np.median(tree.query(tree.data, k=7)[0][:, -1])
     near = tree.query(vertices)[0] <= 2.0 * spacing if len(vertices) else np.empty(0, bool)
     faces = faces[near[faces].all(1)] if len(faces) else faces

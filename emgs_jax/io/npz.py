@@ -1,6 +1,6 @@
-"""Reading .npz files of anyone: nothing is unpickled, and nothing is allocated that the file does not hold.
+"""Read .npz files safely: nothing is unpickled, and no array is larger than the file says and holds.
 
-Those of this program have a header beside their arrays, an object of JSON.
+This program's own files have a JSON header beside their arrays.
 """
 
 import io
@@ -17,7 +17,7 @@ from numpy.lib import format as npy
 from emgs_jax.io.files import atomic_write
 
 _HEADERS = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-MAX_INFLATED = 2**33  # bytes of an array that is compressed; more is no array of anyone's
+MAX_INFLATED = 2**33  # bytes of a compressed array
 
 
 def read_npz(
@@ -26,15 +26,11 @@ def read_npz(
     optional: Sequence[str] = (),
     may_be_compressed: bool = False,
 ) -> dict[str, np.ndarray]:
-    """Arrays of an .npz as `numpy.savez` writes it, all or those of `names`.
-
-    Args:
-        names: that must be there; None: all that are there.
-        optional: that are read beside `names` where they are there.
-        may_be_compressed: as `numpy.savez_compressed` writes it.
+    """Read the arrays `names` of an .npz, which must be there (None: all), and those of `optional` that are.
 
     Raises:
-        ValueError: it is damaged or compressed, lacks a name, or an array's header does not fit its bytes.
+        ValueError: the file is damaged, lacks a name, is compressed though it may not, or an array's header does not
+            fit its bytes.
     """
     try:
         with zipfile.ZipFile(io.BytesIO(content) if isinstance(content, bytes) else content) as archive:
@@ -53,7 +49,7 @@ def read_npz(
 def save_headed(
     path: str | os.PathLike, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], key: str = "__header__"
 ) -> None:
-    """Write a header and arrays, whole or not at all; `key` names the header among the arrays."""
+    """Write a header and arrays atomically; `key` names the header among the arrays."""
     content = json.dumps(header, default=lambda value: value.item())
     with atomic_write(path) as handle:
         np.savez(handle, **{key: np.array(content)}, **arrays)
@@ -62,15 +58,7 @@ def save_headed(
 def load_headed(
     path: str | os.PathLike, ours: Mapping[str, Any], key: str = "__header__"
 ) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read header and arrays of `save_headed`.
-
-    Args:
-        ours: what the header must say: format, version and the like.
-
-    Raises:
-        OSError: the file cannot be read.
-        ValueError: it is damaged, or its header says something else; the message does not name it.
-    """
+    """Read a file of `save_headed`; ValueError, which does not name it, unless its header has the values of `ours`."""
     with open(path, "rb") as handle:
         arrays = read_npz(handle)
     try:
@@ -85,7 +73,7 @@ def load_headed(
 
 
 def npz_names(content: IO[bytes]) -> list[str]:
-    """The names of the arrays of an .npz; ValueError where it is none."""
+    """The names of the arrays in an .npz; ValueError if it is none."""
     try:
         with zipfile.ZipFile(content) as archive:
             return [name.removesuffix(".npy") for name in archive.namelist()]
@@ -94,13 +82,13 @@ def npz_names(content: IO[bytes]) -> list[str]:
 
 
 def _read_array(archive: zipfile.ZipFile, member: zipfile.ZipInfo, may_be_compressed: bool) -> np.ndarray:
-    """One array; its bytes are there before its shape is believed."""
+    """Read one array, after its shape is checked against its bytes."""
     is_compressed = member.compress_type != zipfile.ZIP_STORED
     if is_compressed and not may_be_compressed:
         raise ValueError(f"{member.filename} is compressed, which numpy.savez does not do")
     if is_compressed and member.file_size > MAX_INFLATED:
         raise ValueError(f"{member.filename} announces {member.file_size} bytes, more than {MAX_INFLATED}")
-    data = archive.read(member)  # whole, so that the checksum is tested
+    data = archive.read(member)  # to the end, so that the checksum is tested
     handle = io.BytesIO(data)
     read_header = _HEADERS.get(npy.read_magic(handle))
     if read_header is None:

@@ -1,4 +1,4 @@
-"""Packages that need not be there, and those that are compiled for another version of PyTorch."""
+"""Optional packages, and PyTorch's companions that were compiled for another version of it."""
 
 import importlib
 import importlib.util
@@ -13,14 +13,7 @@ REMEDIES = {
 
 
 def extra(module: str, words: str, name: str) -> ModuleType:
-    """Import a module that one of the extras of this package brings.
-
-    Args:
-        words: what needs it, for the message.
-
-    Raises:
-        ValueError: it is not installed; the message says how it would be.
-    """
+    """Import a module of the extra `name`; ValueError, which begins with `words`, if it is not installed."""
     try:
         return importlib.import_module(module)
     except ImportError as error:
@@ -28,27 +21,22 @@ def extra(module: str, words: str, name: str) -> ModuleType:
 
 
 def companion_problem() -> str | None:
-    """Say which companion of PyTorch is installed but cannot be imported, why, and the remedy; None where all is well.
+    """Name the installed companion of PyTorch that cannot be imported, the reason and the remedy; None if all can.
 
-    Others import them when they find them, and then report what they could not import themselves.
+    Other packages import a companion that they find, and report its failure as their own.
     """
     for name, remedy in REMEDIES.items():
         if importlib.util.find_spec(name) is None:
             continue
         try:
             importlib.import_module(name)
-        except Exception as error:  # a library that is missing, an operator that is missing, another CUDA
+        except Exception as error:  # a missing library, a missing operator, another CUDA
             return f"{name} {_version(name)} does not fit torch {_version('torch')} ({first_line(error)}): {remedy}"
     return None
 
 
 def best_device(torch: ModuleType, what: str, key: str) -> str:
-    """A GPU if there is one; a CPU, which nobody asked for, is mentioned.
-
-    Args:
-        what: runs there, for the message.
-        key: of the config that would ask for it.
-    """
+    """Return "cuda" if there is a GPU, else "cpu", and warn that `what` is slow there; `key`=cpu would ask for it."""
     if torch.cuda.is_available():
         return "cuda"
     print(
@@ -60,7 +48,7 @@ def best_device(torch: ModuleType, what: str, key: str) -> str:
 
 
 def first_line(error: BaseException) -> str:
-    """The first line of what an error says, or its type: some of PyTorch's go on for pages."""
+    """The first line of an error's message, or its type: some of PyTorch's messages are pages long."""
     lines = str(error).strip().splitlines()
     return lines[0].strip()[:300] if lines else type(error).__name__
 

@@ -1,4 +1,4 @@
-"""PLY: clouds, triangles, and Gaussians as viewers of 3D Gaussian splatting read them."""
+"""Write PLY: clouds, meshes, and Gaussians for viewers of 3D Gaussian splatting."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -23,14 +23,14 @@ def save_gaussians_ply(
     labels: Any = None,
     classes: Sequence[str] = (),
 ) -> int:
-    """Write Gaussians as 3D Gaussian splatting viewers read them; returns how many, rows that are not finite left out.
+    """Write Gaussians in the layout of 3D Gaussian splatting, without rows that are not finite; return their number.
 
     Args:
-        means: (n, 3), metres, world.
-        covs: (n, 3, 3), square metres; written as log standard deviations and a quaternion (w, x, y, z).
-        colors: (n, 3), RGB in [0, 1]; written as the zeroth spherical harmonic.
-        opacity: a number or (n,), in (0, 1); written as its logit.
-        normals: (n, 3) or None for zeros.
+        means: (n, 3).
+        covs: (n, 3, 3), written as log standard deviations and a quaternion w, x, y, z.
+        colors: (n, 3), RGB in [0, 1], written as the zeroth spherical harmonic.
+        opacity: a number or (n,), in (0, 1), written as its logit.
+        normals: (n, 3); None: zero.
         labels, classes: see `write_ply`.
     """
     means, covs, colors = (np.asarray(value, np.float64) for value in (means, covs, colors))
@@ -52,7 +52,7 @@ def save_gaussians_ply(
 def save_points_ply(
     path: str | os.PathLike, points: Any, normals: Any, colors: Any, labels: Any = None, classes: Sequence[str] = ()
 ) -> int:
-    """Write a cloud: points (n, 3) in metres, normals (n, 3), colours (n, 3) RGB in [0, 1]. Returns how many rows."""
+    """Write the finite rows of points, normals and RGB in [0, 1], each (n, 3); return their number."""
     rows = np.concatenate([np.asarray(points), np.asarray(normals)], 1).astype(np.float32)
     keep = np.isfinite(rows).all(1)
     vertices = with_colors(structured(rows[keep], ["x", "y", "z", "nx", "ny", "nz"]), np.asarray(colors)[keep])
@@ -70,10 +70,10 @@ def write_ply(
     """Write a binary little-endian PLY.
 
     Args:
-        vertices: structured array (n,); its field names become the properties, in order.
-        faces: triangles as vertex indices, int (t, 3); None for a cloud.
-        labels: (n,) or None for no property `label`; -1 = none.
-        classes: names of the labels, which the header's comments say.
+        vertices: structured array (n,); its fields become the properties.
+        faces: vertex indices (t, 3); None for a cloud.
+        labels: (n,), -1 = none; None for no property `label`.
+        classes: names of the labels, for the header's comments.
     """
     if labels is not None:
         vertices = with_fields(vertices, {"label": labels.astype("i4")})
@@ -95,18 +95,18 @@ def write_ply(
 
 
 def structured(rows: np.ndarray, names: list[str]) -> np.ndarray:
-    """Rows (n, c) of one type as a structured array (n,) with one field per column."""
+    """View rows (n, c) as a structured array (n,) with one field per column."""
     return np.ascontiguousarray(rows).view([(name, rows.dtype) for name in names])[:, 0]
 
 
 def with_colors(rows: np.ndarray, colors: np.ndarray) -> np.ndarray:
-    """A structured array with the fields red, green and blue, 8 bits each, of RGB (n, 3) in [0, 1]."""
+    """Add the 8-bit fields red, green and blue, from RGB (n, 3) in [0, 1]."""
     channels = np.rint(255.0 * np.nan_to_num(colors).clip(0.0, 1.0)).astype(np.uint8)
     return with_fields(rows, dict(zip(("red", "green", "blue"), channels.T, strict=True)))
 
 
 def with_fields(rows: np.ndarray, columns: Mapping[str, np.ndarray]) -> np.ndarray:
-    """A structured array (n,) with more fields; `recfunctions.append_fields` takes a second for 100,000 rows."""
+    """Add fields to a structured array; `recfunctions.append_fields` takes a second for 100,000 rows."""
     types = [(name, rows.dtype[name]) for name in rows.dtype.names]
     found = np.empty(len(rows), types + [(name, column.dtype) for name, column in columns.items()])
     for name in rows.dtype.names:

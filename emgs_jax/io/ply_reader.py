@@ -1,4 +1,4 @@
-"""Reading PLY: what the header says must be in the file, or nothing of it is read."""
+"""Read PLY strictly: the file must hold what its header says."""
 
 import math
 import os
@@ -18,7 +18,7 @@ _MAX_HEADER_BYTES = 1 << 20
 
 
 class Element(NamedTuple):
-    """Element of a PLY header, with `count` rows in the body: its properties by name, a type or None for a list."""
+    """An element of a PLY header; `properties` maps names to types, None for a list."""
 
     name: str
     count: int
@@ -26,7 +26,7 @@ class Element(NamedTuple):
 
 
 def read_vertices(path: str | os.PathLike) -> dict[str, np.ndarray]:
-    """The properties of the vertices of a PLY, each (n,) in the type that the header says; x, y and z are there.
+    """Read the properties of a PLY's vertices, each (n,) in the header's type.
 
     Raises:
         ValueError: the file is no PLY, is shorter or longer than its header says, or has no x, y and z.
@@ -48,19 +48,17 @@ def read_vertices(path: str | os.PathLike) -> dict[str, np.ndarray]:
 
 
 def num_faces(path: str | os.PathLike) -> int:
-    """Count the faces that a PLY announces."""
+    """The number of faces in a PLY's header."""
     with Path(path).open("rb") as file:
         _, elements, _ = _header(file.read(_MAX_HEADER_BYTES + len("\r\n")), path)
     return sum(element.count for element in elements if element.name == "face")
 
 
 def scale_ply(path: str | os.PathLike, target: str | os.PathLike, factor: float) -> None:
-    """Copy a PLY that begins with its vertices, in binary, with all lengths times `factor`.
-
-    x, y and z, and scale_0 to scale_2 of Gaussians, which are logarithms; all other bytes stay, comments too.
+    """Copy a binary PLY that begins with its vertices; x, y, z and Gaussians' scales are multiplied by `factor`.
 
     Raises:
-        ValueError: as `read_vertices`, or a file in ascii or with something before the vertices.
+        ValueError: as `read_vertices`, or the file is ascii or has something before the vertices.
     """
     read_vertices(path)
     content = Path(path).read_bytes()
@@ -78,22 +76,23 @@ def scale_ply(path: str | os.PathLike, target: str | os.PathLike, factor: float)
 
 
 def _header(content: bytes, path: object) -> tuple[str, list[Element], int]:
-    """Byte order ("" is text), elements, and where the body starts."""
+    """Byte order ("" for text), elements and offset of the body."""
     if not content.startswith((b"ply\n", b"ply\r")):
         raise ValueError(f"{path} is no PLY file (it does not begin with the word ply): give a PLY file")
     end = content.find(b"end_header", 0, _MAX_HEADER_BYTES)
     start = content.find(b"\n", end) + 1
     if end < 0 or start == 0:
         raise ValueError(f"{path} has no end_header: it is truncated, {REMEDY}")
-    order, elements = None, []
+    order, elements, names = None, [], []
     for number, line in enumerate(content[:end].decode("ascii", "replace").splitlines()[1:], start=2):
         match line.split():
             case ["comment" | "obj_info", *_] | []:
                 continue
             case ["format", name, "1.0"] if name in _BYTE_ORDERS:
                 order = _BYTE_ORDERS[name]
-            case ["element", name, count] if _is_count(count) and name not in [other.name for other in elements]:
+            case ["element", name, count] if count.isdecimal() and len(count) < 19 and name not in names:
                 elements.append(Element(name, int(count), {}))
+                names.append(name)
             case ["property", *kinds, name] if elements and name not in elements[-1].properties and _is_type(kinds):
                 elements[-1].properties[name] = None if kinds[0] == "list" else _TYPES[kinds[0]]
             case _:
@@ -103,24 +102,19 @@ def _header(content: bytes, path: object) -> tuple[str, list[Element], int]:
     return order, elements, start
 
 
-def _is_count(word: str) -> bool:
-    """Test whether a word is a number of rows that a file can have."""
-    return word.isdecimal() and len(word) < 19
-
-
 def _is_type(words: list[str]) -> bool:
-    """Test whether words of a header are a type, or `list` and the types of its length and elements."""
+    """Test whether words are a type, or `list` with the types of its length and its elements."""
     is_list = len(words) == 3 and words[0] == "list"
     return {*words[1:]} <= _TYPES.keys() if is_list else len(words) == 1 and words[0] in _TYPES
 
 
 def _row_type(element: Element, order: str) -> np.dtype:
-    """One row of an element without lists."""
+    """The type of one row of an element without lists."""
     return np.dtype([(name, order + str(kind)) for name, kind in element.properties.items()])
 
 
 def _check_size(num_bytes: int, elements: list[Element], path: object) -> None:
-    """ValueError where a binary body is not as long as its header says; a list takes one byte or more."""
+    """Raise ValueError if a binary body has not the length that its header says; a list takes one byte or more."""
     is_open = any(None in element.properties.values() for element in elements)
     sizes = [sum(np.dtype(kind or "u1").itemsize for kind in element.properties.values()) for element in elements]
     expected = sum(size * element.count for size, element in zip(sizes, elements, strict=True))
@@ -133,7 +127,7 @@ def _check_size(num_bytes: int, elements: list[Element], path: object) -> None:
 
 
 def _read_text(body: bytes, elements: list[Element], vertex: Element, path: object) -> dict[str, np.ndarray]:
-    """The vertices of a file in ascii: one line for each row of each element."""
+    """Read the vertices of an ascii file, which has a line for each row of each element."""
     lines = [line for line in body.decode("ascii", "replace").splitlines() if line.strip()]
     expected = sum(element.count for element in elements)
     if len(lines) != expected:
@@ -148,7 +142,7 @@ def _read_text(body: bytes, elements: list[Element], vertex: Element, path: obje
             raise ValueError(f"{path}, vertex {row} (from 0): {what}: {REMEDY}") from error
     read = {}
     for name, column in zip(vertex.properties, table.T, strict=True):
-        with np.errstate(invalid="ignore"):  # of what is no number
+        with np.errstate(invalid="ignore"):  # nan as an integer
             read[name] = column.astype(vertex.properties[name])
         if read[name].dtype.kind in "iu" and not (fits := read[name] == column).all():
             row = int(np.argmin(fits))

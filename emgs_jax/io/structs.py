@@ -1,4 +1,4 @@
-"""Structs of arrays as JSON and a few arrays: data classes, named tuples, mappings, sequences; nothing is executed."""
+"""Serialize structs (data classes, named tuples, mappings, sequences) as JSON and a few arrays; nothing is executed."""
 
 import math
 from collections.abc import Collection, Mapping
@@ -12,7 +12,7 @@ import numpy as np
 
 
 def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
-    """Describe a struct as JSON; its arrays are parts of one array for each of their types, which come with it."""
+    """Describe a struct as JSON, and concatenate its arrays by type."""
     parts: dict[str, list[np.ndarray]] = {}
     sizes: dict[str, int] = {}
 
@@ -29,7 +29,7 @@ def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
             return {"": [name, begin, list(array.shape), isinstance(value, jax.Array)]}
         if isinstance(value, Mapping):
             return {"": [[described(key), described(one)] for key, one in value.items()]}
-        names = _names(value)
+        names = [field.name for field in fields(value)] if is_dataclass(value) else getattr(value, "_fields", ())
         if names:
             return {type(value).__name__: {name: described(getattr(value, name)) for name in names}}
         return [described(one) for one in value]
@@ -39,10 +39,7 @@ def pack(value: Any) -> tuple[Any, dict[str, np.ndarray]]:
 
 
 def unpack(said: Any, arrays: Mapping[str, np.ndarray], classes: Collection[type]) -> Any:
-    """Rebuild what `pack` has described; sequences become tuples.
-
-    Args:
-        classes: that may be among it.
+    """Rebuild what `pack` described, of these classes; sequences become tuples.
 
     Raises:
         ValueError, KeyError, TypeError: it is damaged.
@@ -64,9 +61,3 @@ def unpack(said: Any, arrays: Mapping[str, np.ndarray], classes: Collection[type
         return {rebuilt(key): rebuilt(value) for key, value in content}
 
     return rebuilt(said)
-
-
-def _names(value: Any) -> list[str]:
-    if is_dataclass(value):
-        return [field.name for field in fields(value)]
-    return list(getattr(value, "_fields", ()))

@@ -1,9 +1,8 @@
-"""Tensors of a file that `torch.save` wrote: read without torch, and without running what is in it.
+"""Read the tensors of a file of `torch.save` without torch, and without running code of the file.
 
-Such a file is an archive: a pickle of what was saved, and a member for every storage. Before version 1.6 it was five
-pickles (magic number, version, the machine, what was saved, names of storages) and then every storage: its number of
-elements and its bytes. The instructions of what was saved are followed only as far as they make dictionaries, lists and
-numbers, and describe tensors; what else a pickle could ask for is refused.
+The file is an archive: a pickle of what was saved, and a member for every storage. Before version 1.6 it was five
+pickles (magic number, version, machine, what was saved, names of storages) and then every storage: its number of
+elements and its bytes. Only instructions that make dictionaries, lists, numbers and tensors are followed.
 """
 
 import math
@@ -33,11 +32,7 @@ class _Tensor(NamedTuple):
 
 
 def read_tensors(content: bytes, key: str | None) -> dict[str, np.ndarray]:
-    """The tensors by name that stand under `key` of what was saved; None = they are all that was.
-
-    Raises:
-        ValueError: it is no such file, or damaged.
-    """
+    """Read tensors by name, under `key` of what was saved (None: at the top); ValueError if the file is damaged."""
     try:
         saved, storages = (_from_archive if content.startswith(b"PK") else _from_stream)(BytesIO(content))
         tensors: Mapping[str, _Tensor] = saved if key is None else saved[key]
@@ -47,7 +42,7 @@ def read_tensors(content: bytes, key: str | None) -> dict[str, np.ndarray]:
 
 
 def _from_archive(stream: BytesIO) -> tuple[Any, dict[str, np.ndarray]]:
-    """What was saved, and its storages by name."""
+    """What was saved, and the storages by name."""
     with ZipFile(stream) as archive:
         first = [name for name in archive.namelist() if name.endswith("/data.pkl")][0]
         saved = _value(BytesIO(archive.read(first)))
@@ -57,28 +52,26 @@ def _from_archive(stream: BytesIO) -> tuple[Any, dict[str, np.ndarray]]:
 
 
 def _from_stream(stream: BytesIO) -> tuple[Any, dict[str, np.ndarray]]:
-    """Likewise of a file before version 1.6."""
+    """What was saved, and the storages by name, before version 1.6."""
     if _value(stream) != MAGIC:
         raise ValueError("not of torch.save")
     _, _, saved, names = (_value(stream) for _ in range(4))
     known = {tensor.storage[2]: tensor.storage for tensor in _tensors(saved)}
-    return saved, {name: _storage(stream, known[name]) for name in names}
+    storages = {}
+    for name in names:
+        count = known[name][4]
+        if int.from_bytes(stream.read(8), "little") != count:
+            raise ValueError("a storage has another number of elements than its tensor says")
+        storages[name] = _numbers(stream.read(count * np.dtype(DTYPES[known[name][1]]).itemsize), known[name])
+    return saved, storages
 
 
 def _numbers(content: bytes, described: tuple) -> np.ndarray:
     return np.frombuffer(content, np.dtype(DTYPES[described[1]]), described[4])
 
 
-def _storage(stream: BytesIO, described: tuple) -> np.ndarray:
-    """The next storage of the stream."""
-    dtype, count = np.dtype(DTYPES[described[1]]), described[4]
-    if int.from_bytes(stream.read(8), "little") != count:
-        raise ValueError("a storage has another number of elements than its tensor says")
-    return _numbers(stream.read(count * dtype.itemsize), described)
-
-
 def _array(storage: np.ndarray, tensor: _Tensor) -> np.ndarray:
-    """A tensor of its storage; only those that lie there row by row are known."""
+    """A tensor from its storage, where it must lie row by row."""
     steps = [math.prod(tensor.shape[axis + 1 :]) for axis in range(len(tensor.shape))]
     if any(step != known and size > 1 for step, known, size in zip(steps, tensor.strides, tensor.shape, strict=True)):
         raise ValueError("a tensor is no plain array")
@@ -94,7 +87,7 @@ def _tensors(value: Any) -> list[_Tensor]:
 
 
 def _value(stream: BytesIO) -> Any:
-    """The value of the next pickle of a stream, of plain data and tensors."""
+    """Follow the next pickle of a stream, as far as it makes plain data and tensors."""
     stack: list[Any] = []
     memo: dict[int, Any] = {}
 
@@ -138,7 +131,7 @@ def _value(stream: BytesIO) -> Any:
 
 
 def _made(name: str, arguments: tuple) -> Any:
-    """Stand-in for what a function that is named in the file would make."""
+    """What a function that the file names would make."""
     if name == "collections OrderedDict" and not arguments:
         return {}
     if name == "torch._utils _rebuild_tensor_v2":

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.io.files import write_file
 
-MAX_VALUE, MAX_NORM_ERROR = 1e9, 1e-2  # of other systems, whose units are their own and whose digits may be few
+MAX_VALUE, MAX_NORM_ERROR = 1e9, 1e-2  # other systems have their own units, and few digits
 
 
 def save_trajectory_tum(path: str | os.PathLike, timestamps: Any, T_world_camera: Any) -> None:
-    """Write poses (n, 4, 4) as lines `timestamp tx ty tz qx qy qz qw`, metres, camera → world, qw ≥ 0."""
+    """Write poses (n, 4, 4) with qw ≥ 0."""
     poses, timestamps = np.asarray(T_world_camera, np.float64), np.asarray(timestamps, np.float64)
     if poses.shape != (len(timestamps), 4, 4) or not np.isfinite(poses).all():
         raise ValueError(f"T_world_camera must be finite ({len(timestamps)}, 4, 4), got {poses.shape}")
@@ -30,7 +30,7 @@ def to_tum(pose: np.ndarray) -> tuple[float, ...]:
 
 
 def from_tum(values: np.ndarray) -> np.ndarray:
-    """Poses (n, 4, 4) of tx, ty, tz, qx, qy, qz, qw (n, 7); rows that are not finite become nan."""
+    """Poses (n, 4, 4) of tx, ty, tz, qx, qy, qz, qw (n, 7); a row that is not finite gives nan."""
     is_finite = np.isfinite(values).all(1)
     poses = np.where(is_finite[:, None, None], np.eye(4), np.nan)
     poses[is_finite, :3, 3] = values[is_finite, :3]
@@ -40,11 +40,7 @@ def from_tum(values: np.ndarray) -> np.ndarray:
 
 
 def load_trajectory_tum(path: str | os.PathLike, may_lack: bool = False) -> tuple[np.ndarray, np.ndarray]:
-    """Read a TUM trajectory: timestamps (n,) and T_world_camera (n, 4, 4), float64; `#` starts a comment.
-
-    Args:
-        may_lack: a pose of nan is one that is not known.
-    """
+    """Read timestamps (n,) and T_world_camera (n, 4, 4), float64; with `may_lack` a pose of nan is unknown."""
     rows = []
     for number, line in enumerate(Path(path).read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         fields = line.split("#")[0].split()

@@ -1,4 +1,4 @@
-"""Interface of a prior: for a window of images, the pose of every view and dense geometry of some of them."""
+"""Interface of a prior: it predicts the poses of a window of images, and dense geometry of some of them."""
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Sequence
@@ -16,9 +16,9 @@ class Window:
 
     Args:
         inference: number of the call, from 0.
-        views: frame indices in the order that the model sees them; `views[0]` is the anchor (frame 0).
-        dense: frame indices whose dense geometry the mapping needs: all views of the first window up to the current
-            one, then (previous, current).
+        views: frame indices in the model's order; `views[0]` is the anchor (frame 0).
+        dense: frame indices whose geometry is needed: in the first window all up to the current one, then (previous,
+            current).
         current: the frame that this call integrates; in the first window the last of `dense`.
     """
 
@@ -30,30 +30,27 @@ class Window:
 
 @dataclass(frozen=True)
 class PriorPrediction:
-    """The answer of a prior to one window. Poses are in the frame of view 0, geometry in each view's own camera.
+    """A prior's prediction of a window; poses are in the frame of view 0, points in each view's own camera.
 
-    A prior that has lost view 0 may still know how others are to each other. Then view 0 has no pose, and the frame of
-    those that have one is the answer's own. It is the same from answer to answer as long as two in a row (answers
-    without any pose left out) have a pose for the same view.
+    If the prior has lost view 0, its pose is NaN, and the other poses are in a frame of their own. That frame stays the
+    same as long as two predictions in a row (without those that have no pose) have a pose for the same view.
 
     Args:
-        T_anchor_view: camera -> camera of view 0, OpenCV axes, metres, float64 (v, 4, 4), NaN where it is not known;
-            the first is the identity, or NaN: then the others are camera -> a frame of their own.
+        T_anchor_view: camera -> camera of view 0, OpenCV axes, metres, float64 (v, 4, 4), NaN where unknown; the first
+            is the identity or NaN.
         points: camera-frame points, metres, float32 (d, h, w, 3), rows as in `window.dense`; 0 where the mask is off.
         confidence: float32 (d, h, w), at least 1; higher is better.
         mask: bool (d, h, w), True where the point can be used.
-        features: text-aligned unit features (d, y, x, f), float16, on a grid of y by x cells that cover the image, from
-            one cell per patch of a network to one per pixel; 0 where there is none, f = 0 without features.
-        pose_covariance: how sure the poses are: float64 (v, 6, 6), of ξ where the true T_anchor_view is
-            T_anchor_view Exp(ξ), translation (unit of the prediction) before rotation (rad), in the axes of the view.
-            What a view errs like those before it, of which the map is made, counts for nothing. NaN for a view of which
-            nothing is known, None where the prior does not say: then the map finds out. Poses that are known lie in one
-            world: the scale of a frame's depths does not move them.
-        scale_std: how sure the scale of the current frame's depths is: of the logarithm of their common factor, in the
-            unit of the poses. 0 where they are triangulated from these poses. None where the prior does not say; it
-            counts only where `pose_covariance` is known.
-        world: number of the frame of reference that the poses are in, of a prior that tells: 0 is that of the first
-            frames with a pose, and it may come back. None: a new one begins where no view has a pose as before.
+        features: text-aligned unit features (d, y, x, f), float16, on a grid of y by x cells that cover the image (a
+            patch or a pixel each); 0 where there is none, f = 0 without features.
+        pose_covariance: float64 (v, 6, 6), of ξ where the true T_anchor_view is T_anchor_view Exp(ξ), translation (unit
+            of the prediction) before rotation (rad), in the view's axes. An error that the views before share, of which
+            the map is made, does not count. NaN for an unknown view; None: the prior does not tell, and the map
+            estimates it. Poses with a covariance lie in one world: the scale of a frame's depths does not move them.
+        scale_std: standard deviation of the log of a common factor of the current frame's depths, in the poses' unit; 0
+            if they are triangulated from these poses. None: the prior does not tell. Needs `pose_covariance`.
+        world: number of the poses' frame of reference, 0 for the first, which may come back. None: a new one begins
+            where no view has a pose as before.
     """
 
     window: Window
@@ -69,7 +66,7 @@ class PriorPrediction:
 
 @dataclass(frozen=True)
 class Provenance:
-    """Origin of predictions; it is written into every result and every recorded file."""
+    """Origin of predictions, which is written into every result and recording."""
 
     name: str
     settings: dict = field(default_factory=dict)
@@ -77,40 +74,33 @@ class Provenance:
 
 
 class Prior(ABC):
-    """Anything that predicts geometry from a window of frames: a subclass has `provenance` and `predict`.
-
-    `predict` is deterministic. What else callers ask for has the answer of a prior without it.
-
-    Attributes:
-        provenance: where its predictions come from.
-        feature_names: classes that `text_features` describes; empty without features.
-        text_features: (classes, f) unit embeddings comparable with `PriorPrediction.features`.
-    """
+    """Predicts geometry from a window of frames: a subclass needs `provenance` and a deterministic `predict`."""
 
     provenance: Provenance
-    feature_names: tuple[str, ...] = ()
+    feature_names: tuple[str, ...] = ()  # classes that `text_features` describes
+    # (classes, f) unit embeddings, comparable with `PriorPrediction.features`
     text_features: np.ndarray = np.zeros((0, 0), np.float32)
 
     @abstractmethod
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Predict for `frames`, which are in the order of `window.views`."""
+        """Predict for `frames`, in the order of `window.views`."""
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
-        """Predict for views of two visits of a place, see `visits`; None where that is not known."""
+        """Predict for views of two visits of a place, see `visits`; None if unknown."""
         return self.predict(window, frames, intrinsics)
 
     def num_newer(self, window_size: int) -> int:
-        """Images after the current one that its windows have, see `windows`: a camera's frames are mapped so late."""
+        """Number of images after the current one in a window, see `windows`; live frames are mapped that much later."""
         return 1
 
     def check(self, dataset: Dataset, window_size: int) -> None:  # noqa: B027 (most can answer for any data set)
-        """Raise ValueError where the prior cannot answer for the data set."""
+        """Raise ValueError if the prior cannot predict for the data set."""
 
     def keep(self, folder: Path) -> None:  # noqa: B027 (most have nothing to keep)
-        """Keep in the folder of a run what the predictions rest on, and take it from there where it is."""
+        """Store what the predictions depend on in the folder of a run, or load it from there."""
 
     def report(self) -> dict[str, float]:
-        """Return the prior's own statistics of its predictions so far, as keys `prior/…`."""
+        """Statistics of the predictions so far, as keys `prior/…`."""
         return {}
 
 
@@ -119,10 +109,9 @@ USUAL_DEPTH = 2.0
 
 
 def check_unit(prediction: PriorPrediction) -> None:
-    """Raise ValueError where depths are so large or small that they can be no metres; says a factor that helps.
+    """Raise ValueError, with a factor that helps, if depths are too large or too small for metres.
 
-    A map's thresholds are lengths, so a prior has to have metres or a scene of some units. One that knows no unit
-    normalises its lengths, as `prior=files` does with `scale=arbitrary`: then its own does not matter.
+    A map's thresholds are lengths. A prior without a unit normalises its lengths, as `prior.scale=arbitrary` of files.
     """
     depths = prediction.points[..., 2][prediction.mask & np.isfinite(prediction.points).all(-1)]
     median = float(np.median(depths)) if len(depths) else USUAL_DEPTH
@@ -139,10 +128,8 @@ def check_unit(prediction: PriorPrediction) -> None:
 def windows(num_frames: int, window_size: int, num_newer: int = 1) -> Iterator[Window]:
     """Yield the calls of a sequence: one that fills the FIFO, then one for each further frame.
 
-    A step sees the anchor, the current image, the `num_newer` after it, as far as the sequence has them, and those
-    before it, `window_size` + 2 in all; an image is never listed twice. So with more newer images the windows are the
-    same, and the current image is an older one of them; the last images of a sequence have fewer after them, and one
-    less in all.
+    A window has the anchor, the current image, `num_newer` after it (fewer at the end) and those before it, at most
+    `window_size` + 2 in all, each once. More newer images give the same windows with an older current image.
     """
     if not isinstance(window_size, int) or window_size < 1:
         raise ValueError(f"slam.window_size must be a whole number of images, 1 or more, got {window_size}")
@@ -159,17 +146,16 @@ def windows(num_frames: int, window_size: int, num_newer: int = 1) -> Iterator[W
 
 
 def visits(a: int, b: int, spacing: int, window_size: int) -> Window:
-    """The call that shows two visits of a place together: frame a, which is the anchor, and b, which comes later.
+    """The call for two visits of a place: the anchor a and the later frame b, with frames `spacing` beside them.
 
-    Beside them it has the frames `spacing` before and after a, and before b: none that is later than b. Its number is
-    that of the step that integrates b, of a prior that sees one newer image.
+    No view is later than b. The number is that of the step that integrates b, of a prior that sees one newer image.
     """
     views = [index for index in (a, a - spacing, a + spacing, b - spacing, b) if 0 <= index <= b]
     return Window(max(b - window_size + 1, 0), tuple(dict.fromkeys(views)), (a, b), b)
 
 
 def with_frames(calls: Iterable[Window], dataset: Dataset) -> Iterator[tuple[Window, dict[int, Frame]]]:
-    """Yield each window with its frames; one is read when a window needs it and dropped when the next does not."""
+    """Yield each window with its frames; a frame is kept while consecutive windows need it."""
     frames: dict[int, Frame] = {}
     for window in calls:
         frames = {index: frames[index] if index in frames else dataset[index] for index in window.views}
@@ -177,7 +163,7 @@ def with_frames(calls: Iterable[Window], dataset: Dataset) -> Iterator[tuple[Win
 
 
 def check_order(window: Window, frames: Sequence[Frame]) -> None:
-    """Raise ValueError where `frames` are not those of `window.views`."""
+    """Raise ValueError unless `frames` are those of `window.views`."""
     indices = tuple(frame.index for frame in frames)
     if indices != window.views:
         raise ValueError(f"frames must be those of window.views {window.views} in that order, got {indices}")
@@ -187,7 +173,7 @@ DenseView = tuple[np.ndarray, np.ndarray, np.ndarray]  # points (h, w, 3), confi
 
 
 def no_points(size: Sequence[int]) -> DenseView:
-    """A view of (width, height) of which nothing is known."""
+    """A view of (width, height) without a valid point."""
     shape = size[1], size[0]
     return np.zeros((*shape, 3), np.float32), np.ones(shape, np.float32), np.zeros(shape, bool)
 
@@ -195,14 +181,14 @@ def no_points(size: Sequence[int]) -> DenseView:
 def predicted(
     window: Window, T_anchor_view: np.ndarray, dense: Sequence[DenseView], features: np.ndarray | None = None, **known
 ) -> PriorPrediction:
-    """The answer with these dense views, and without features if there are none."""
+    """Stack dense views into a prediction."""
     points, confidence, mask = (np.stack(parts) for parts in zip(*dense, strict=True))
     features = np.zeros((*mask.shape, 0), np.float16) if features is None else features
     return PriorPrediction(window, T_anchor_view, points, confidence, mask, features, **known)
 
 
 def equal_covariances(pose_std: Sequence[float] | None, T_anchor_view: np.ndarray) -> np.ndarray | None:
-    """Covariances of poses of which each errs by `pose_std`, a length and degrees, along every axis; None for none."""
+    """Covariances of poses with the same standard deviations (length, degrees) along every axis; None without."""
     if pose_std is None:
         return None
     length, degrees = pose_std
@@ -212,7 +198,7 @@ def equal_covariances(pose_std: Sequence[float] | None, T_anchor_view: np.ndarra
 
 
 def check_pose_std(pose_std: Sequence[float] | None) -> tuple[float, float] | None:
-    """The key `prior.pose_std` as numbers; ValueError where it is no length and angle."""
+    """Check the key `prior.pose_std`: a length and an angle, or None."""
     if pose_std is None:
         return None
     try:
@@ -225,7 +211,7 @@ def check_pose_std(pose_std: Sequence[float] | None) -> tuple[float, float] | No
 
 
 def relative_poses(T_reference_view: Sequence[np.ndarray]) -> np.ndarray:
-    """Poses in the camera of view 0, float64 (v, 4, 4), of poses in any common frame; the first is the identity."""
+    """Poses (v, 4, 4) relative to the first, float64; the first is exactly the identity."""
     poses = np.asarray(T_reference_view, np.float64)
     relative = np.linalg.inv(poses[0]) @ poses
     relative[0] = np.eye(4)

@@ -1,21 +1,16 @@
-"""Predictions written to disk once and replayed bit for bit.
+"""Record predictions on disk and replay them bit for bit.
 
-The format `emgs_jax.predictions`, version 3, is a folder; nothing in it is ever unpickled:
+The format `emgs_jax.predictions`, version 3, is a folder without pickles:
 
-- `manifest.json`: UTF-8 JSON object with `format`, `version`, `dataset` (name, sequence, fingerprint, num_frames, size,
-  intrinsics), `window_size`, `provenance` (name, settings, is_simulated), `feature_names`, `num_inferences`,
-  `complete` (all inferences are there), `files` (file name -> SHA-256 of its content) and `sha256` (of all the other
-  keys, as JSON with sorted keys and without spaces), so that no changed bit goes unnoticed.
+- `manifest.json`: the keys of `MANIFEST`, `format`, `version`, and `sha256` of all other keys (as JSON, sorted, without
+  spaces); `files` maps file names to the SHA-256 of their contents.
+- `000000.npz`, …, one per inference: `inference` (), `views` (v,), `dense` (d,), `current` () and the arrays of
+  `PriorPrediction`, optional ones if the prior gives them: about d·(17·h·w + 2·y·x·f) bytes. Points are float32, as a
+  float16 step is 2 mm at 2 to 4 m.
+- `visits_A_…_B.npz`, one per inference with views of two visits (`recorded_visits`), likewise.
 - `text_features.npz`: the array `text_features` (classes, f).
-- `visits_A_…_B.npz`, for pairs of frames that show one place twice, named by all its views: as below, of one more
-  inference with views of both visits (`recorded_visits`). A folder may have none.
-- `000000.npz`, …, one file per inference: `inference` (), `views` (v,), `dense` (d,), `current` () and the arrays of
-  `PriorPrediction` in the dtypes stated there, `pose_covariance`, `scale_std` and `world` only where the prior gives
-  them: about d·(17·h·w + 2·y·x·f) bytes. Features are float16; points are not, because a float16
-  step is 2 mm at 2 to 4 m.
 
-Each file is written under a temporary name and then renamed, data before the manifest: a full disk or an interrupted
-run leaves a valid folder, which `record` completes.
+Files are written atomically, data before the manifest: `record` completes what was interrupted.
 """
 
 import hashlib
@@ -48,7 +43,7 @@ FORMAT, VERSION = "emgs_jax.predictions", 3
 WINDOW = ("inference", "views", "dense", "current")
 COMPLETE = "`python -m experiments.predict`, called as for the others, makes what is missing or damaged"
 REMEDY = "record into another folder with `python -m experiments.predict`"
-FIELDS = {  # array -> dtype and the axes that it has; d, v, h, w, i, j, c, k, l have one length each, y, x, f are free
+FIELDS = {  # array -> dtype and axes; d, v, h, w, i, j, c, k, l have one length each, y, x, f are free
     "T_anchor_view": (np.float64, "vij"),
     "points": (np.float32, "dhwc"),
     "confidence": (np.float32, "dhw"),
@@ -56,7 +51,7 @@ FIELDS = {  # array -> dtype and the axes that it has; d, v, h, w, i, j, c, k, l
     "features": (np.float16, "dyxf"),
 }
 OPTIONAL = {"pose_covariance": (np.float64, "vkl"), "scale_std": (np.float64, ""), "world": (np.int64, "")}
-MAX_LENGTH = 1e6  # of positions, in the prior's unit: more is no room
+MAX_LENGTH = 1e6  # of a position, in the prior's unit
 MANIFEST = {
     "dataset": {"name": str, "sequence": str, "num_frames": int, "size": list, "intrinsics": list, "fingerprint": str},
     "window_size": int,
@@ -69,7 +64,7 @@ MANIFEST = {
 
 
 def check_manifest(path: object, manifest: Mapping[str, Any], expected: Mapping[str, Any] = MANIFEST) -> None:
-    """Raise ValueError where a manifest lacks a key, one has another type, or a block has another key."""
+    """Raise ValueError if a key of a manifest is missing, unknown or of another type."""
     for key, kind in expected.items():
         kind, block = (dict, kind) if isinstance(kind, dict) else (kind, None)
         if type(manifest.get(key)) is not kind or (block and manifest[key].keys() - block.keys()):
@@ -80,7 +75,7 @@ def check_manifest(path: object, manifest: Mapping[str, Any], expected: Mapping[
 
 
 def check_arrays(path: object, arrays: Mapping[str, np.ndarray], sizes: Mapping[str, int]) -> None:
-    """Raise ValueError where an array has not the dtype and shape of the format."""
+    """Raise ValueError if an array has another dtype or shape than the format."""
     sizes = {**sizes, "i": 4, "j": 4, "c": 3, "k": 6, "l": 6}
     for key, (dtype, axes) in (FIELDS | {key: OPTIONAL[key] for key in OPTIONAL if key in arrays}).items():
         got = arrays[key]
@@ -92,10 +87,7 @@ def check_arrays(path: object, arrays: Mapping[str, np.ndarray], sizes: Mapping[
 
 
 def check_numbers(path: object, arrays: Mapping[str, np.ndarray]) -> None:
-    """Raise ValueError where numbers that the mask lets through, or the poses, mean nothing.
-
-    A pose that is not finite is allowed: there the prior has none.
-    """
+    """Raise ValueError if numbers under the mask, or finite poses, are senseless; other poses are unknown."""
     points, confident = arrays["points"][arrays["mask"]], arrays["confidence"][arrays["mask"]]
     poses = arrays["T_anchor_view"]
     poses = poses[np.isfinite(poses).all((1, 2))]
@@ -118,10 +110,7 @@ def record(
     folder: Path | str,
     progress: Callable[[Sequence[Window]], Iterable[Window]] = iter,
 ) -> None:
-    """Write what `prior` predicts for every window of `dataset`; inferences that are there already are kept.
-
-    `progress` wraps the list of windows, e.g. tqdm.
-    """
+    """Write the predictions of every window of a data set, keeping those that exist; `progress` is tqdm or the like."""
     folder = Path(folder)
     calls = list(windows(len(dataset), window_size, prior.num_newer(window_size)))
     header = {
@@ -134,7 +123,7 @@ def record(
         "num_inferences": len(calls),
         "complete": False,
     }
-    header = json.loads(json.dumps(header))  # as it is read
+    header = json.loads(json.dumps(header))  # as it will be read
     files = _resume(folder, header)
     folder.mkdir(parents=True, exist_ok=True)
     remove_temporaries(folder)
@@ -151,12 +140,12 @@ def record(
 
 
 def visits_file(window: Window) -> str:
-    """Name of the file of an inference with two visits."""
+    """The file name of an inference with two visits."""
     return f"visits_{'_'.join(f'{view:06d}' for view in window.views)}.npz"
 
 
 def add_visits(folder: Path, prediction: PriorPrediction) -> None:
-    """Write a prior's prediction of two visits into a recording that is complete."""
+    """Add a prediction of two visits to a complete recording."""
     manifest, name = _read_manifest(folder), visits_file(prediction.window)
     files = manifest.pop("files")
     files[name] = _write_npz(folder / name, _arrays(prediction))
@@ -164,11 +153,11 @@ def add_visits(folder: Path, prediction: PriorPrediction) -> None:
 
 
 class Recorded(Prior):
-    """A prior that replays a folder written by `record`.
+    """A prior that replays a complete recording.
 
     Args:
-        folder: the recording; it must be complete.
-        pose_std: of every pose, a length in the recording's unit and degrees, in place of what is recorded; None: that.
+        folder: written by `record`.
+        pose_std: of every pose, (length in the recording's unit, degrees), in place of recorded covariances.
     """
 
     def __init__(self, folder: Path | str, pose_std: Sequence[float] | None = None) -> None:
@@ -193,12 +182,12 @@ class Recorded(Prior):
             )
 
     def num_newer(self, window_size: int) -> int:
-        """Those that the prior asked for: in the first window they come after the dense ones but for the newest."""
+        """The number that was recorded: the first window's newer views come after the dense ones."""
         first = self._load("000000.npz", ("views", "dense"))
         return 1 + len(first["views"]) - len(first["dense"])
 
     def check(self, dataset: Dataset, window_size: int) -> None:
-        """Raise ValueError where the recording is not of this data set, calibration and window size."""
+        """Raise ValueError unless the recording is of this data set, calibration and window size."""
         expected = _described(dataset) | {"window_size": window_size}
         recorded = self._manifest["dataset"] | {"window_size": self._manifest["window_size"]}
         for key, value in expected.items():
@@ -209,16 +198,16 @@ class Recorded(Prior):
                 )
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Return the recorded prediction of `window`; of `frames` only the number and size are looked at."""
+        """The recorded prediction of `window`; only number and size of `frames` are checked."""
         return self._answer(f"{window.inference:06d}.npz", window, frames, intrinsics)
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
-        """Return what was recorded of two visits; None where that was not."""
+        """The recorded prediction of two visits, or None."""
         name = visits_file(window)
         return self._answer(name, window, frames, intrinsics) if name in self._manifest["files"] else None
 
     def has_whole(self, name: str) -> bool:
-        """Test by its checksum whether a file is there as it was written."""
+        """Test by its checksum whether a file is as it was written."""
         return _digest_of(self.folder / name) == self._manifest["files"].get(name, "")
 
     def _answer(
@@ -241,8 +230,7 @@ class Recorded(Prior):
         check_numbers(self.folder / name, arrays)
         given = equal_covariances(self._pose_std, arrays["T_anchor_view"])
         covariance = arrays.get("pose_covariance") if given is None else given
-        world = int(arrays["world"]) if "world" in arrays else None
-        scale_std = float(arrays["scale_std"]) if "scale_std" in arrays else None
+        scale_std, world = (arrays[key].item() if key in arrays else None for key in ("scale_std", "world"))
         return PriorPrediction(window, *(arrays[key] for key in FIELDS), covariance, scale_std, world)
 
     def _load(self, name: str, keys: Sequence[str], optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
@@ -260,7 +248,7 @@ class Recorded(Prior):
 
 
 def _described(dataset: Dataset) -> dict:
-    """Return what identifies the frames that were predicted, as JSON gives it back."""
+    """What identifies the frames, as JSON gives it back."""
     return {
         "name": dataset.name,
         "sequence": dataset.sequence,
@@ -272,7 +260,7 @@ def _described(dataset: Dataset) -> dict:
 
 
 def _resume(folder: Path, header: dict) -> dict[str, str]:
-    """Return the files (name -> SHA-256) of an earlier, perhaps interrupted `record` with the same header."""
+    """The files (name -> SHA-256) of an earlier `record` with the same header."""
     if not (folder / "manifest.json").exists():
         return {}
     old = _read_manifest(folder)
@@ -285,7 +273,7 @@ def _resume(folder: Path, header: dict) -> dict[str, str]:
 
 
 def _read_manifest(folder: Path) -> dict:
-    """Read and verify the manifest."""
+    """Read and check the manifest."""
     path = folder / "manifest.json"
     if not path.is_file():
         raise ValueError(f"{path} is missing: expected the folder of a recording (manifest.json, 000000.npz, …)")
@@ -313,29 +301,24 @@ def _digest_of(path: Path) -> str | None:
 
 def _write_manifest(folder: Path, header: dict, files: dict[str, str]) -> None:
     manifest = header | {"files": files}
-    text = json.dumps(manifest | {"sha256": _digest(manifest)}, indent=1)
-    _write(folder / "manifest.json", text.encode())
-
-
-def _write(path: Path, content: bytes) -> str:
-    """Write `path` whole or not at all; return the SHA-256 of the content."""
-    write_file(path, content)
-    return hashlib.sha256(content).hexdigest()
+    write_file(folder / "manifest.json", json.dumps(manifest | {"sha256": _digest(manifest)}, indent=1))
 
 
 def _write_npz(path: Path, arrays: dict[str, np.ndarray]) -> str:
+    """Write an .npz atomically; return its SHA-256."""
     buffer = io.BytesIO()
     np.savez(buffer, **arrays)
-    return _write(path, buffer.getvalue())
+    write_file(path, buffer.getvalue())
+    return hashlib.sha256(buffer.getvalue()).hexdigest()
 
 
 def _arrays(prediction: PriorPrediction) -> dict[str, np.ndarray]:
-    """Return the arrays of one inference's file; ValueError where a dtype is not the format's."""
+    """The arrays of one inference's file; ValueError if one has another dtype than the format."""
     arrays = {key: np.asarray(getattr(prediction.window, key)) for key in WINDOW}
     given = {key: OPTIONAL[key] for key in OPTIONAL if getattr(prediction, key) is not None}
     for key, (dtype, _) in (FIELDS | given).items():
         arrays[key] = np.asarray(getattr(prediction, key))
         if arrays[key].dtype != dtype:
-            # A conversion would make the replay differ from the live run.
+            # After a conversion the replay would differ from the live run.
             raise ValueError(f"the prior's {key} must be {np.dtype(dtype)}, got {arrays[key].dtype}")
     return arrays

@@ -1,4 +1,4 @@
-"""Windows of two visits of a place in a recording: which these are is found from images and recorded depths alone."""
+"""Windows of two visits of a place in a recording, found from images and recorded depths."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Sequence
@@ -27,9 +27,8 @@ def places_seen_twice(
 ) -> list[tuple[int, int]]:
     """Find pairs of frames, the earlier first, of similar appearance whose keypoints fit one motion of the camera.
 
-    A run detects its loop candidates in the same way, and verifies more. Candidates that it finds beside these, because
-    it began with other keyframes (a saved map, frames that were lost at first, `slam.initialization=merged`), are not
-    recorded.
+    A run detects loop candidates likewise. If it has other keyframes (a saved map, frames lost at first,
+    `slam.initialization=merged`), it may find others, which are not recorded.
     """
     database, pairs, seen = Database(), [], set()
     calls = list(windows(len(dataset), window_size, replay.num_newer(window_size)))
@@ -59,10 +58,7 @@ def record_visits(
     spacing: int,
     progress: Callable[[Sequence[tuple[int, int]]], Iterable[tuple[int, int]]] = iter,
 ) -> int:
-    """Add the predictions of both visits of each pair to a recording that is complete; return how many it holds.
-
-    Those that are there already are kept; of visits of which the prior knows nothing there are none.
-    """
+    """Add the prior's predictions of both visits of each pair to a complete recording; return how many it holds."""
     replay, known = Recorded(folder), 0
     for a, b in progress(pairs):
         window = visits(a, b, spacing, window_size)

@@ -1,4 +1,4 @@
-"""The other views that a view is matched or compared with, and their choice."""
+"""Choose the other views that a view is matched or compared with."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -15,13 +15,13 @@ from emgs_jax.structure.model import Structure
 class Sources(NamedTuple):
     """Other views."""
 
-    views: Any  # what of them is compared, such as grey images in [0, 1], features or depths (m, 0 = none); batched
-    T_source_view: jaxlie.SE3  # view -> source, batched likewise
-    is_used: Bool[Array, "s"]  # sources that count
+    views: Any  # what is compared, such as grey images in [0, 1], features or depths (0 = none); batched
+    T_source_view: jaxlie.SE3  # view -> source, batched
+    is_used: Bool[Array, "s"]  # False for padding
 
 
 def sources_of(found: Structure, frame: int, others: Sequence[int], count: int, view: Callable[[int], Any]) -> Sources:
-    """The first `count` of `others`; where they are fewer, they are repeated, and the repetitions do not count."""
+    """The first `count` of `others`, padded by repetitions that do not count."""
     is_used = np.arange(count) < len(others)
     others, poses = (list(others) * count)[:count], found.T_world_camera
     T = np.stack([np.linalg.inv(poses[other]) @ poses[frame] for other in others])
@@ -30,7 +30,7 @@ def sources_of(found: Structure, frame: int, others: Sequence[int], count: int, 
 
 
 def placed_beside(found: Structure, frame: int) -> list[int]:
-    """Frames of the same world that show landmarks, without this one, the nearest in time first."""
+    """Other frames of the same world that show landmarks, the nearest in time first."""
     others = np.flatnonzero((found.world == found.world[frame]) & found.is_placed)
     others = others[others != frame]
     return others[np.argsort(np.abs(others - frame), kind="stable")].tolist()
@@ -45,16 +45,11 @@ def parallax(
 
 
 def choose(worth: dict[int, Float[np.ndarray, "l"]], count: int) -> list[int]:
-    """The views, at most `count`, that together are worth most to all landmarks, best first.
+    """Choose at most `count` views greedily, best first, by their worth to every landmark (0: does not show it).
 
-    One after the other is added that most increases Σ √w over the landmarks, w what the chosen views are worth to one.
-    The root saturates: what no chosen view shows yet counts most, so the side to which the camera turns has its
-    sources, too. Adding the best is within 1 − 1/e of the best choice of all (Nemhauser, Wolsey and Fisher, Math.
-    Programming 1978).
-
-    Args:
-        worth: of every view to every landmark, 0 where it does not show it.
-        count: of views.
+    Each adds most to Σ √w over the landmarks, where w is the worth of the chosen views. The root saturates, so
+    landmarks that no chosen view shows count most. Greedy is within 1 − 1/e of the optimum (Nemhauser, Wolsey and
+    Fisher, Math. Programming 1978).
     """
     left, chosen, total = dict(worth), [], np.zeros(1)
     while left and len(chosen) < count:

@@ -1,4 +1,4 @@
-"""Priors that answer as another one does, but for its features, their texts, or what masks leave out."""
+"""Priors that change another one's features, text embeddings or masks."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -9,11 +9,11 @@ import numpy as np
 from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.features.base import FeatureModel
 from emgs_jax.features.text import load_text
-from emgs_jax.prior.base import Prior, PriorPrediction, Provenance, Window
+from emgs_jax.prior.base import Prior, PriorPrediction, Window
 
 
 class Wrapped(Prior):
-    """A prior that answers as another one does, but for what a subclass changes."""
+    """A prior that delegates to another one, except for what a subclass changes."""
 
     def __init__(self, prior: Prior) -> None:
         self._prior, self.provenance = prior, prior.provenance
@@ -39,10 +39,7 @@ class Wrapped(Prior):
 
 
 class Featured(Wrapped):
-    """A prior whose predictions have the features of a feature model in place of their own.
-
-    Predictions of two visits keep the prior's own: only geometry is needed there.
-    """
+    """A prior with the features of a feature model; predictions of two visits need none."""
 
     def __init__(self, prior: Prior, model: FeatureModel) -> None:
         super().__init__(prior)
@@ -51,24 +48,19 @@ class Featured(Wrapped):
         features = {**model.settings, "model": model.identity}  # before the text: names all missing files
         self.feature_names, self.text_features = model.text.names, model.text.vectors
         features |= {"templates": [*model.text.templates]}
-        geometry = prior.provenance
-        self.provenance = Provenance(
-            f"{geometry.name}+{model.identity['name']}",
-            geometry.settings | {"features": features},
-            geometry.is_simulated,
-        )
+        name, settings = f"{self.provenance.name}+{model.identity['name']}", self.provenance.settings
+        self.provenance = replace(self.provenance, name=name, settings=settings | {"features": features})
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         super().check(dataset, window_size)
         self._model.check(dataset)
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Predict geometry, and describe the dense images; an image of the window before is not described again."""
+        """Predict geometry, and extract features of the dense images that the window before did not have."""
         prediction = super().predict(window, frames, intrinsics)
         by_index = {frame.index: frame for frame in frames}
-        known = [(by_index[index], self._features(by_index[index])) for index in window.dense]
-        self._known = known
-        return replace(prediction, features=np.stack([features for _, features in known]))
+        self._known = [(by_index[index], self._features(by_index[index])) for index in window.dense]
+        return replace(prediction, features=np.stack([features for _, features in self._known]))
 
     def _features(self, frame: Frame) -> np.ndarray:
         for known, features in self._known:
@@ -79,7 +71,7 @@ class Featured(Wrapped):
 
 
 class Requeried(Wrapped):
-    """A prior whose features are a feature model's, with the text embeddings of a file of `experiments.embed`."""
+    """A prior with features of a model, compared with the text embeddings of a file of `experiments.embed`."""
 
     def __init__(self, prior: Prior, path: str) -> None:
         super().__init__(prior)
@@ -96,7 +88,7 @@ class Requeried(Wrapped):
 
 
 class Masked(Wrapped):
-    """A prior without a point where `Frame.mask` is."""
+    """A prior without points under `Frame.mask`."""
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         return _without_masked(super().predict(window, frames, intrinsics), frames)

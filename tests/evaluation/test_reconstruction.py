@@ -17,16 +17,20 @@ from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds, spooled, transfo
 from emgs_jax.evaluation.reconstruction import (
     camera_cloud,
     compare_clouds,
+    compare_means,
     compare_placements,
     ground_truth_cloud,
     posed,
-    reconstruction_metrics,
     reference,
 )
 from emgs_jax.geometry import Sim3
 
 REPLICA = Path(__file__).resolve().parents[3] / "shared" / "data" / "replica"
 CONFIG = evaluation_config()
+
+
+def reconstruction_metrics(estimate, truth, config):
+    return compare_means(spooled([estimate], np.float64, has_colors=False).averaged(config.voxel_m), truth, config)
 
 
 def grid_cloud(offset=0.0, n=40, spacing=0.05):

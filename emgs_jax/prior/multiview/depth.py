@@ -18,21 +18,18 @@ from emgs_jax.prior.sources import Sources
 
 
 class DepthConfig(eqx.Module):
-    """Matching, and what a depth must pass."""
+    """Matching, and which depths are accepted."""
 
     sweep: SweepConfig = field(default_factory=SweepConfig)
     semi_global: SemiGlobalConfig = field(default_factory=SemiGlobalConfig)
     max_cost: Float[Array, "*b"] = traced(0.4, low=0, high=math.inf)  # of the best plane, before aggregation
-    # by which the aggregated cost of any plane that is not next to the best must exceed the best's
-    min_margin: Float[Array, "*b"] = traced(0.0, low=0)
-    # aggregated cost above the best's at which a plane is 1/e as plausible
-    temperature: Float[Array, "*b"] = traced(0.05, low=1e-6)
-    # half the side of the window whose median replaces a depth: removes speckle, keeps edges
-    median_radius: int = static(2, low=0, high=32)
+    min_margin: Float[Array, "*b"] = traced(0.0, low=0)  # aggregated cost of a distant plane above the best's
+    temperature: Float[Array, "*b"] = traced(0.05, low=1e-6)  # cost above the best's at which plausibility is 1/e
+    median_radius: int = static(2, low=0, high=32)  # of the median filter, which removes speckle
 
 
 def _between_planes(total: Float[Array, "h w d"], best: Array) -> Float[Array, "h w"]:
-    """Locate the minimum between planes, as an offset from `best` in planes, by the parabola through three costs."""
+    """Offset of the minimum from `best`, in planes, by the parabola through three costs."""
     last = total.shape[-1] - 1
     before, at, after = (
         jnp.take_along_axis(total, jnp.clip(best + step, 0, last)[..., None], axis=-1)[..., 0] for step in (-1, 0, 1)
@@ -44,14 +41,14 @@ def _between_planes(total: Float[Array, "h w d"], best: Array) -> Float[Array, "
 
 
 def _spread(total: Float[Array, "h w d"], best: Array, temperature: Float[Array, ""]) -> Float[Array, "h w"]:
-    """Root mean square distance, in planes, of the plausible planes from the best: flat or repeated costs give many."""
+    """RMS distance of the plausible planes from the best, in planes."""
     plausible = jax.nn.softmax(-total / temperature, axis=-1)
     distance = jnp.arange(total.shape[-1]) - best[..., None]
     return jnp.sqrt(jnp.sum(plausible * distance**2, axis=-1))
 
 
 def _median(depth: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:
-    """Median of the surroundings; a hole (0) stays one unless most of its surroundings are surface."""
+    """Median filter; a hole (0) stays one unless most of its surroundings are surface."""
     height, width = depth.shape
     padded = jnp.pad(depth, radius, mode="edge")
     steps = range(2 * radius + 1)
@@ -69,14 +66,8 @@ def estimate_depth(
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """Depth z (m) of every pixel, 0 where no plane stands out or the best is the first or last; and its spread.
 
-    The spread is how far plausible planes lie from the best, in planes. A plane is a step of 1/z, so the same spread
-    is a larger share of the depth where the surface is far or the baseline short.
-
-    Args:
-        gray: the view, in [0, 1].
-        sources: likewise.
-        depth_range: nearest and farthest depth that is tried, m.
-        camera: of all views.
+    The spread is the RMS distance of plausible planes from the best, in planes, which are steps of 1/z. Images are in
+    [0, 1]; `depth_range` is the nearest and the farthest depth to try.
     """
     planes = inverse_depths(depth_range[0], depth_range[1], config.sweep)
     cost = sweep(gray, sources, planes, camera, config.sweep)
@@ -96,16 +87,10 @@ def estimate_depth(
 def mean_difference(
     depth: Float[Array, "h w"], others: Sources, camera: Camera, depth_step: Float[Array, ""]
 ) -> Float[Array, "h w"]:
-    """By what fraction other depth maps differ from each depth, -δ₀ log mean exp(-d / δ₀); inf where none has any.
+    """Relative difference of other depth maps from each depth, -δ₀ log mean exp(-d / δ₀); inf where none has a depth.
 
-    δ₀ is `depth_step`: a view that differs by much more, or shows nothing there, counts as one that does not confirm,
-    however much it is.
-
-    Args:
-        depth: of the view, m; 0 = none.
-        others: with theirs.
-        camera: of all views.
-        depth_step: δ₀, as a fraction.
+    δ₀ is `depth_step`: a view that differs by much more, or shows nothing there, just does not confirm. Depths are 0
+    where there is none.
     """
     points = unproject(camera, depth)
 
@@ -125,14 +110,9 @@ def mean_difference(
 
 @full_precision
 def pixels_per_log_depth(depth: Float[Array, "h w"], sources: Sources, camera: Camera) -> Float[Array, "h w"]:
-    """By how many pixels each point moves in a source while log z grows by one, in that where it moves most.
+    """Motion of each point in a source, in pixels per unit of log z, in the source where it moves most.
 
-    0 where no source shows the point, or its ray goes through the sources' centres. A depth of 0 has no point.
-
-    Args:
-        depth: of the view, m.
-        sources: whose views are not looked at.
-        camera: of all.
+    0 where no source shows the point, its ray goes through the sources' centres, or the depth is 0.
     """
     points = unproject(camera, depth)
 

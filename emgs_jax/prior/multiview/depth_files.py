@@ -1,8 +1,8 @@
-"""Depths of any network in files, as the programs write them: one file a frame, or one for all.
+"""Depths of any network in files: one file a frame, or one for all.
 
-Video-Depth-Anything and DepthCrafter write an .npz of a whole video, Depth Anything and MiDaS pictures of 8 or 16 bits
-(each stretched to its range, which a scale and a shift a frame undo) or .pfm, Marigold .npy. Files are of the frames
-whose names they have, with what a program adds to all of them (`_depth`), or in order.
+Video-Depth-Anything and DepthCrafter write an .npz of a whole video, Depth Anything and MiDaS images of 8 or 16 bits
+(each stretched to its range, which a scale and a shift per frame undo) or .pfm, Marigold .npy. Files belong to frames
+by name, apart from a common ending such as `_depth`, or by order.
 """
 
 from collections.abc import Callable, Sequence
@@ -25,7 +25,7 @@ from emgs_jax.prior.multiview.lens import rectify
 from emgs_jax.prior.multiview.monocular import MonocularConfig, begin_monocular
 from emgs_jax.structure.model import Structure
 
-SUFFIXES = (".npz", ".npy", ".pfm", ".exr", ".png")  # the first that is there is read
+SUFFIXES = (".npz", ".npy", ".pfm", ".exr", ".png")  # the first that exists is read
 KEYS = ("depth", "depths", "disparity", "disparities", "inverse_depth", "prediction")  # of an .npz with several arrays
 
 
@@ -46,13 +46,12 @@ class DepthFiles(NamedTuple):
 
 
 def way_of_files(config: DepthFilesConfig) -> Way:
-    """The way to depth that reads it; ValueError where there are no files, or none that can be read."""
+    """Depth that is read from files; ValueError if there are none, or they cannot be read."""
     folder = Path(config.folder).expanduser()
     found = open_depths(folder, config.kind, check_depth_scale(config.depth_scale, "prior.dense.depth_scale"))
 
     def check(dataset: Dataset) -> None:
-        read = _reader(dataset, found, folder)
-        read(0)
+        _reader(dataset, found, folder)(0)
 
     def begin(scene: Scene) -> tuple[Structure, Depths]:
         read = _reader(scene.dataset, found, folder)
@@ -67,11 +66,9 @@ def way_of_files(config: DepthFilesConfig) -> Way:
 
 
 def open_depths(folder: Path, kind: str, depth_scale: float) -> DepthFiles:
-    """The depths in a folder, or in one file."""
-    if folder.is_file():
-        paths = [folder]
-    else:
-        paths = next((found for suffix in SUFFIXES if (found := files_of(folder, suffix))), [])
+    """Find the depths in a folder, or in one file."""
+    in_folder = (found for suffix in SUFFIXES if (found := files_of(folder, suffix)))
+    paths = [folder] if folder.is_file() else next(in_folder, [])
     if not paths or paths[0].suffix not in SUFFIXES:
         below = sorted(path.name for path in folder.glob("*/") if path.is_dir())
         remedy = f"; it has the folders {', '.join(below[:5])}: give one of them" if below else ""
@@ -93,7 +90,7 @@ def open_depths(folder: Path, kind: str, depth_scale: float) -> DepthFiles:
 
 
 def _load_npz(path: Path) -> np.ndarray:
-    """The one array of an .npz, or that with a name that says depth."""
+    """The only array of an .npz, or the first of `KEYS`."""
     names = names_in(path)
     key = names[0] if len(names) == 1 else next((key for key in KEYS if key in names), None)
     if names and key is None:
@@ -113,7 +110,7 @@ def _load_png(path: Path, kind: str, depth_scale: float) -> np.ndarray:
 
 
 def _image(values: np.ndarray, kind: str, path: Path) -> np.ndarray:
-    """Values (h, w) in float32, NaN where there are none: not finite, or a depth that is not above 0."""
+    """Values (h, w), float32; NaN where they are not finite, or a depth is not above 0."""
     values = np.squeeze(values)
     if values.ndim != 2 or values.dtype.kind not in "fui" or min(values.shape) < 2:
         raise ValueError(f"{path} must be depths (h, w), got {values.dtype} {values.shape}")
@@ -123,7 +120,7 @@ def _image(values: np.ndarray, kind: str, path: Path) -> np.ndarray:
 
 
 def _reader(dataset: Dataset, found: DepthFiles, folder: Path) -> Callable[[int], np.ndarray]:
-    """Values of a frame at its pixels."""
+    """Return a function that reads the values of a frame at its pixels."""
     rows = [row for row in rows_of(dataset, found.names, folder) if row is not None]
     size = dataset.size[0], dataset.size[1]
     camera = Camera(size, dataset.intrinsics)
@@ -131,7 +128,7 @@ def _reader(dataset: Dataset, found: DepthFiles, folder: Path) -> Callable[[int]
     def read(frame: int) -> np.ndarray:
         values = found.read(rows[frame])
         whole_image(camera, View(f"{found.files[min(rows[frame], len(found.files) - 1)]}", values))
-        # Nothing is mixed across an edge of depth where the file has a value for every pixel.
+        # Where the file has a value for every pixel, no values are mixed across a depth edge.
         way = cv2.INTER_LINEAR if values.shape[1] < size[0] else cv2.INTER_NEAREST_EXACT
         return cv2.resize(values, size, interpolation=way)
 

@@ -1,13 +1,13 @@
-"""Depths of a network that sees one image, or a video, brought to the scale of landmarks whose depth is known.
+"""Fit scale and shift of a monocular or video network's depths to landmarks of known depth.
 
     log y = s + log(u + c (m - u)) + e,   u = a v + b
 
-v is what the network says of a pixel and y the depth z or, of networks that say inverse depth, 1/z. Slope a, intercept
-b and median m are of the whole sequence. Every frame has a log scale s and, where the kind has a shift, a shift c, the
-share of y's differences from m that is taken away. Both are random walks along the sequence, and e is the error of the
-network, common to the landmarks of a cell of the image, beside that of the landmark itself. Errors and steps follow
-Student's t, so outliers and jumps of the scale count little: iteratively reweighted least squares (the EM algorithm
-of the t, Lange, Little and Taylor, JASA 1989) about one linear smoother. The variances are estimated with it.
+v is the network's value at a pixel, y the depth z or, if the network predicts inverse depth, 1/z. Slope a, intercept b
+and median m belong to the whole sequence. Every frame has a log scale s and, if the kind has a shift, a shift c, which
+shrinks y's differences from m. Both are random walks. e is the network's error, shared by the landmarks of a cell of
+the image, plus the landmark's own. Errors and steps follow Student's t, so outliers and jumps count little: iteratively
+reweighted least squares (EM for the t, Lange, Little and Taylor, JASA 1989) around a linear smoother, which also
+estimates the variances.
 """
 
 from collections.abc import Sequence
@@ -22,23 +22,21 @@ from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.landmarks import Landmarks
 
 KINDS = ("metric", "up_to_scale", "affine", "affine_inverse")
-LEAST_RATIO = 0.02  # of a predicted to a true y, below which one is as wrong as the other
-MAX_SHIFT = 0.95  # at 1 all depths are alike
+LEAST_RATIO = 0.02  # of predicted to true y; smaller ones count as this
+MAX_SHIFT = 0.95  # at 1 all depths would be equal
 
 
 @dataclass(frozen=True)
 class LandmarkFitConfig:
-    """What is assumed of scale, shift and errors before the landmarks are seen."""
+    """Prior assumptions about scale, shift and errors."""
 
     std: float = number(0.05, low=1e-4, high=10)  # of log y, the network's error
     step_std: float = number(0.01, low=1e-6, high=10)  # of the log scale and of the shift, from a frame to the next
     shift_std: float = number(1.0, low=1e-3, high=100)  # of the shift itself
     dof: float = number(4.0, low=1, high=1000)  # degrees of freedom of Student's t
     weight: float = number(3.0, low=0, high=1000)  # of these assumptions, in frames
-    # of a frame that begins at a fit of its own, instead of its neighbours'
-    min_landmarks: int = number(12, low=3, high=10000)
-    # of the ranks of v and y: below, the landmarks contradict the kind
-    min_correlation: float = number(0.3, low=0, high=1)
+    min_landmarks: int = number(12, low=3, high=10000)  # of a frame that starts at its own fit
+    min_correlation: float = number(0.3, low=0, high=1)  # rank correlation of v and y; less contradicts the kind
     num_steps: int = number(20, low=1, high=1000)  # of the iteration
 
 
@@ -48,13 +46,13 @@ class LandmarkFit(NamedTuple):
     is_inverse: bool  # y is 1/z
     base: tuple[float, float, float]  # slope a, intercept b and median m
     parameters: np.ndarray  # (n, 2) log scale s and shift c
-    covariance: np.ndarray  # (n, 2, 2) theirs
-    std: np.ndarray  # (n,) of log y beside a landmark
+    covariance: np.ndarray  # (n, 2, 2) of the parameters
+    std: np.ndarray  # (n,) of the network's log y
     step_std: np.ndarray  # of log scale and shift, from a frame to the next
 
 
 class _Sample(NamedTuple):
-    """What is known of one frame's landmarks: u, y, its log variance, and the weight of each."""
+    """Landmarks of one frame: u, y, variance of log y, weight."""
 
     u: np.ndarray
     y: np.ndarray
@@ -65,14 +63,9 @@ class _Sample(NamedTuple):
 def to_depth(
     values: Float[np.ndarray, "h w"], fit: LandmarkFit, row: int
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Depth z of what a network says of a frame, in the unit of the landmarks, and the standard deviation of log z.
+    """Depth z of a network's values v (NaN = none), in the landmarks' unit, and standard deviation of log z.
 
-    Args:
-        values: v; NaN where there is none.
-        row: of the frame in the fit.
-
-    Returns:
-        Depth 0 and standard deviation inf where there is no value, or one that would lie behind the camera.
+    Depth is 0 and the standard deviation inf without a value, or where the point would lie behind the camera.
     """
     slope, intercept, median = fit.base
     y, by_shift = _predicted(slope * np.float64(values) + intercept, median, fit.parameters[row])
@@ -91,14 +84,13 @@ def fit_to_landmarks(
     kind: str,
     config: LandmarkFitConfig,
 ) -> LandmarkFit:
-    """Scale and shift of every frame.
+    """Fit scale and shift of every frame.
 
     Args:
-        values: of each frame, what the network says at its landmarks; NaN where it says nothing.
-        landmarks: of each frame.
-        frames: numbers of the frames, rising; between distant ones the walk goes farther.
-        kind: `metric` and `up_to_scale` depths have a scale, `affine` depths and `affine_inverse` depths (1/z) a shift,
-            too.
+        values: the network's values at each frame's landmarks; NaN where it has none.
+        frames: ascending numbers of the frames.
+        kind: of `KINDS`; `metric` and `up_to_scale` depths have a scale, `affine` and `affine_inverse` (1/z) also a
+            shift.
 
     Raises:
         ValueError: no frame has enough landmarks, or they contradict the kind.
@@ -124,17 +116,13 @@ def fit_to_landmarks(
 
 
 def _sample(values: np.ndarray, landmarks: Landmarks, is_inverse: bool) -> _Sample:
-    is_known = np.isfinite(values) & (landmarks.depth > 0)
-    if not is_inverse:
-        is_known &= values > 0
-    y = 1.0 / landmarks.depth[is_known] if is_inverse else landmarks.depth[is_known]
-    return _Sample(
-        np.float64(values[is_known]), np.float64(y), landmarks.std[is_known] ** 2, landmarks.weight[is_known]
-    )
+    is_known = np.isfinite(values) & (landmarks.depth > 0) & (is_inverse | (values > 0))
+    _, depth, std, weight = (part[is_known] for part in landmarks)
+    return _Sample(np.float64(values[is_known]), np.float64(1.0 / depth if is_inverse else depth), std**2, weight)
 
 
 def _check_kind(samples: Sequence[_Sample], kind: str, config: LandmarkFitConfig) -> None:
-    """Raise ValueError where what the network says does not grow with y: the ranks of both, median of the frames."""
+    """Raise ValueError unless the values' ranks grow with those of y (median over the frames)."""
     found = float(np.median([np.corrcoef(rankdata(s.u), rankdata(s.y))[0, 1] for s in samples]))
     if np.isfinite(found) and found >= config.min_correlation:
         return
@@ -149,16 +137,16 @@ def _check_kind(samples: Sequence[_Sample], kind: str, config: LandmarkFitConfig
 
 
 def _base(samples: Sequence[_Sample], has_shift: bool) -> tuple[float, float, float]:
-    """Slope a, intercept b and median m of the sequence: the robust fit of all its landmarks."""
+    """Slope a, intercept b and median m of the sequence: a robust fit to all landmarks."""
     u, y, _, weight = (np.concatenate(parts) for parts in zip(*samples, strict=True))
     slope, intercept = _least_absolute(u, y, weight, has_shift)
-    if slope <= 0:  # frames that differ by more than the depths in one
+    if slope <= 0:  # frames differ by more than the depths of one frame
         slope, intercept = _least_absolute(u, y, weight, has_shift=False)
     return slope, intercept, float(np.median(y))
 
 
 def _least_absolute(u: np.ndarray, y: np.ndarray, weight: np.ndarray, has_shift: bool) -> tuple[float, float]:
-    """Slope and intercept of least absolute relative error |(a u + b) / y - 1|, by reweighting."""
+    """Slope and intercept with the least absolute relative error |(a u + b) / y - 1|, by reweighting."""
     inputs = np.stack([u, np.ones_like(u)] if has_shift else [u], axis=1) / y[:, None]
     size = np.sqrt(np.mean(inputs**2, axis=0))
     inputs, found, w = inputs / size, np.zeros(inputs.shape[1]), weight
@@ -171,7 +159,7 @@ def _least_absolute(u: np.ndarray, y: np.ndarray, weight: np.ndarray, has_shift:
 
 
 def _own_fit(sample: _Sample, median: float, has_shift: bool) -> tuple[float, float]:
-    """Log scale and shift of a frame by itself; without a shift where its depths do not tell one."""
+    """Log scale and shift of a frame by itself; shift 0 where its depths do not determine one."""
     slope, intercept = _least_absolute(sample.u, sample.y, sample.weight, has_shift)
     level = slope * median + intercept
     if slope <= (1 - MAX_SHIFT) * level / median or level <= 0:
@@ -181,7 +169,7 @@ def _own_fit(sample: _Sample, median: float, has_shift: bool) -> tuple[float, fl
 
 
 def _predicted(u: np.ndarray, median: float, parameters: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """y, and the derivative of its logarithm by the shift; where y is not above 0 the latter means nothing."""
+    """y, and the derivative of log y by the shift, which is meaningless where y ≤ 0."""
     log_scale, shift = parameters
     mixed = u + shift * (median - u)
     return np.exp(log_scale) * mixed, (median - u) / np.where(mixed > 0, mixed, 1.0)
@@ -196,12 +184,12 @@ def _smoothed(
     has_shift: bool,
     config: LandmarkFitConfig,
 ) -> LandmarkFit:
-    """The fit of all frames, from their own."""
+    """Refine the fits of all frames together."""
     count, dof = len(samples), config.dof
     found, variance = start, np.full(count, config.std**2)
     step_variance = np.full(2, config.step_std**2)
     step_weight = np.ones((max(count - 1, 0), 2))
-    # What the shift is before any landmark: none without one.
+    # Information before any landmark; without a shift it is held at 0.
     prior = np.diag([1e-6, config.shift_std**-2 if has_shift else 1e12])
     for _ in range(config.num_steps):
         evidence = [_evidence(s, base[2], at, v, dof) for s, at, v in zip(samples, found, variance, strict=True)]
@@ -222,14 +210,14 @@ def _smoothed(
 def _evidence(
     sample: _Sample, median: float, parameters: np.ndarray, variance: float, dof: float
 ) -> tuple[np.ndarray, np.ndarray, float, float]:
-    """Information matrix and vector of a frame's landmarks about its parameters; squares and number of its errors."""
+    """Information matrix and vector of a frame's landmarks, and weighted sum of squares and number of its errors."""
     y, by_shift = _predicted(sample.u, median, parameters)
     ratio = np.maximum(y / sample.y, LEAST_RATIO)
     residual, inputs = -np.log(ratio), np.stack([np.ones_like(ratio), by_shift * (y > 0)], axis=1)
     total = variance + sample.variance
     heavy = (dof + 1) / (dof + residual**2 / total)
     weighted = inputs * (sample.weight * heavy / total)[:, None]
-    share = variance / total  # of a residual that is the network's
+    share = variance / total  # of the network in a residual
     squares = heavy * (share * residual) ** 2 + share * sample.variance
     vector = weighted.T @ (residual + inputs @ parameters)
     return weighted.T @ inputs, vector, float(sample.weight @ squares), float(sample.weight.sum())
@@ -238,21 +226,16 @@ def _evidence(
 def smooth(
     information: Float[np.ndarray, "n d d"], vector: Float[np.ndarray, "n d"], step: Float[np.ndarray, "n1 d"]
 ) -> tuple[Float[np.ndarray, "n d"], Float[np.ndarray, "n d d"], Float[np.ndarray, "n1 d"]]:
-    """Means and covariances of a random walk, each of whose places is measured, and the variances of its steps.
+    """Means and covariances of a measured random walk, and the variances of its steps.
 
-    By messages in information form, so that a place may be measured in some directions only (the two-filter smoother,
-    Fraser and Potter, IEEE TAC 1969).
-
-    Args:
-        information: of each place's measurement.
-        vector: information times what is measured.
-        step: information of each coordinate of each step.
+    A two-filter smoother (Fraser and Potter, IEEE TAC 1969) in information form: a state may be measured in some
+    directions only. `vector` is information times measurement, `step` the information of each step's coordinates.
     """
     count, size = vector.shape
     walk = step[:, :, None] * np.eye(size)
 
     def passed(order: range) -> tuple[np.ndarray, np.ndarray]:
-        """What each place is told from the side where `order` begins."""
+        """The messages to each state from the side where `order` begins."""
         matrices, vectors = np.zeros_like(information), np.zeros_like(vector)
         before = None
         for row in order:

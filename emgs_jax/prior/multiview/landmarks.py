@@ -1,4 +1,4 @@
-"""Landmarks of a structure as a frame sees them: where, how far, and how well that is known."""
+"""Landmarks of a structure as seen by a frame: pixel, depth and standard deviation."""
 
 from typing import NamedTuple
 
@@ -10,22 +10,19 @@ from emgs_jax.structure.model import Structure
 
 
 class Landmarks(NamedTuple):
-    """Landmarks that a frame shows."""
+    """Landmarks in a frame."""
 
     pixels: np.ndarray  # (k, 2) column and row
     depth: np.ndarray  # (k,) z in the unit of the structure
     std: np.ndarray  # (k,) of log z
-    # (k,) 1 over the number of landmarks in the same cell of the image: errors of a network are alike there
-    weight: np.ndarray
+    weight: np.ndarray  # (k,) 1 / number of landmarks in the same cell of the image, where a network errs alike
 
 
 def point_information(structure: Structure, world: int, pixel_std: float) -> Float[np.ndarray, "l 3 3"]:
-    """Information matrix of each point of a world, Σ f² / (d² σ²) (I - u uᵀ) over the frames that show it.
+    """Information matrix of each point of a world with fixed poses, Σ f² / (d² σ²) (I - u uᵀ) over the frames.
 
-    f is the focal length, d the distance and u the direction from the frame's camera; the poses are held.
-
-    Args:
-        pixel_std: σ of a keypoint, in pixels of the images that the structure was made of.
+    f is the focal length, d the distance and u the direction from the camera, σ = `pixel_std` that of a keypoint in
+    pixels of the structure's images.
     """
     points = structure.worlds[world].points
     found, focal = np.zeros((len(points), 3, 3)), structure.worlds[world].camera.mean_focal_length()
@@ -41,12 +38,7 @@ def point_information(structure: Structure, world: int, pixel_std: float) -> Flo
 def landmarks_of(
     structure: Structure, frame: int, information: Float[np.ndarray, "l 3 3"], camera: Camera, cell: float
 ) -> Landmarks:
-    """The landmarks of a frame that lie before it, within the image.
-
-    Args:
-        information: of the points of its world.
-        cell: side of a cell, as a share of the image's longer side.
-    """
+    """The landmarks of a frame that lie before it, within the image; `cell` is a share of the image's longer side."""
     points, T = structure.shown(frame), structure.T_world_camera[frame]
     ray = points - T[:3, 3]
     local = ray @ T[:3, :3]

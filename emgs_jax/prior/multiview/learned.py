@@ -1,4 +1,4 @@
-"""Dense depth by a network for multi-view stereo, whose weights the user brings."""
+"""Dense depth by a multi-view stereo network, whose weights the user brings."""
 
 from dataclasses import dataclass, field
 from functools import cache
@@ -19,10 +19,9 @@ from emgs_jax.prior.pretrained.itermvs import IterMVSConfig
 from emgs_jax.prior.pretrained.weights import load_network
 from emgs_jax.prior.sources import Sources
 
-MULTIPLE = 32  # of pixels; the networks halve their images five times
+MULTIPLE = 32  # of the sides; the network halves its images five times
 
-
-jitted = cache(eqx.filter_jit)  # one for all priors of a process
+jitted = cache(eqx.filter_jit)  # shared by all priors of a process
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,14 +29,13 @@ class LearnedConfig(MatchedConfig):
     """Depth by a network."""
 
     network: IterMVSConfig = field(default_factory=IterMVSConfig)
-    # of the images that it is shown, then rounded to what it can take
-    magnification: float = number(1.0, low=0.01, high=16)
+    magnification: float = number(1.0, low=0.01, high=16)  # of its input images, whose sides are rounded
     checkpoint: str | None  # path of its weights
-    sha256: str  # of that file, in hexadecimal digits
+    sha256: str  # of that file, hexadecimal
 
 
 def grid_of(camera: Camera, magnification: float) -> Camera:
-    """The camera of the images that the network is shown: edges lie on edges."""
+    """The camera of the network's input images; image borders stay borders."""
     size = np.array([camera.width, camera.height])
     width, height = np.maximum(np.round(size * magnification / MULTIPLE), 1).astype(int) * MULTIPLE
     ratio = np.float32([width, height]) / np.float32(size)

@@ -1,4 +1,4 @@
-"""Depth of a view that is matched with others: which they are, and what of them is kept."""
+"""Depth of a view by matching it with others: choose them, and cache what is kept of them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,7 +19,7 @@ from emgs_jax.prior.sources import Sources, choose, parallax, placed_beside, sou
 from emgs_jax.structure.model import Structure
 
 jitted_pixels = eqx.filter_jit(pixels_per_log_depth)
-NUM_KEPT = 64  # frames whose images or features are at hand
+NUM_KEPT = 64  # frames whose images or features are cached
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -27,22 +27,20 @@ class MatchedConfig(DenseConfig):
     """Depth by matching a view with its sources."""
 
     num_sources: int = number(6, low=1, high=64)  # views that it is matched against
-    # between the rays of a landmark, beyond which more is no better
-    best_parallax_rad: float = number(0.2, low=1e-6, high=4)
+    best_parallax_rad: float = number(0.2, low=1e-6, high=4)  # between the rays of a landmark; more is no better
 
 
 class Stereo(NamedTuple):
     """How a view is matched."""
 
     prepare: Callable[[np.ndarray, Lens], Any]  # RGB image (h, w, 3), uint8, and its lens -> what is kept of the view
-    # what is kept of the view and of its sources, nearest and farthest depth that is tried (m), camera -> depth (h, w)
-    # in metres, 0 where it is not known, and the spread of what its cost curve takes for plausible, a multiple of the
-    # standard deviation of log z
+    # The view, its sources, nearest and farthest depth to try, camera -> depth (h, w), 0 where unknown, and its spread,
+    # proportional to the standard deviation of log z.
     estimate: Callable[[Any, Sources, Float[Array, "2"], Camera], tuple[np.ndarray, np.ndarray]]
 
 
 def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[Structure, Depths]:
-    """Depth of each frame by stereo with its sources."""
+    """Begin depth of each frame by stereo with its sources."""
     found = scene.structure
 
     @lru_cache(NUM_KEPT)
@@ -65,7 +63,7 @@ def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[
 
 
 def chosen(found: Structure, frame: int, config: MatchedConfig) -> list[int]:
-    """The views that together show the view's landmarks under most parallax, best first."""
+    """The views that together see the frame's landmarks with most parallax, best first."""
     landmarks, points, center = found.landmarks[frame], found.shown(frame), found.T_world_camera[frame, :3, 3]
     worth = {}
     for other in placed_beside(found, frame):

@@ -1,4 +1,4 @@
-"""Depth of a network that looks at one image, or at a video, on the poses of a structure and at its scale."""
+"""Depth of a monocular or video network, fitted to the landmarks of a structure."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -18,33 +18,28 @@ from emgs_jax.structure.model import Structure, scaled
 
 @dataclass(frozen=True, kw_only=True)
 class MonocularConfig(DenseConfig):
-    """Depth that is brought to the scale of landmarks."""
+    """Depth that is fitted to landmarks."""
 
     # Nothing is matched; the spread is that of the landmark fit.
     noise: DepthNoiseConfig = field(
         default_factory=partial(DepthNoiseConfig, pixel_std=0.0, spread_std=1.0, difference_std=1.0, max_std=0.2)
     )
     fit: LandmarkFitConfig = field(default_factory=LandmarkFitConfig)  # scale and shift of each frame
-    # `metric` depths in metres, which the structure takes over; depths `up_to_scale`; `affine` depths, up to a scale
-    # and a shift; `affine_inverse` depths, likewise
+    # `metric`: depths in metres, whose scale the structure takes; `up_to_scale`; `affine`: up to scale and shift;
+    # `affine_inverse`: likewise of 1/z.
     kind: str = one_of(*KINDS)
     depth_margin: float = number(2.0, low=1, high=1000)
-    # side of the part of an image where a network's errors are alike, as a share of its longer side
-    cell: float = number(0.1, low=1e-3, high=1)
-    # of a landmark, in pixels of the images that the structure was made of
-    pixel_std: float = number(1.0, low=1e-3, high=100)
+    cell: float = number(0.1, low=1e-3, high=1)  # share of the image's longer side within which a network errs alike
+    pixel_std: float = number(1.0, low=1e-3, high=100)  # of a landmark, in pixels of the structure's images
 
 
 def begin_monocular(
     scene: Scene, values: Callable[[int], Float[np.ndarray, "h w"]], config: MonocularConfig
 ) -> tuple[Structure, Depths]:
-    """The structure, in metres where the network's depths are metric, and the depth of each frame.
+    """The structure, in metres if the network's depths are, and the depth of each frame.
 
-    Args:
-        values: of a frame, what the network says at the pixels of the pinhole camera; NaN where it says nothing.
-
-    Raises:
-        ValueError: see `fit_to_landmarks`.
+    `values` maps a frame to the network's values at the pinhole camera's pixels, NaN = none. Raises as
+    `fit_to_landmarks`.
     """
     found, fits, rows = scene.structure, [], {}
     for world in range(len(found.worlds)):
@@ -70,7 +65,7 @@ def begin_monocular(
 
 
 def _depths(found: Structure, world: int) -> np.ndarray:
-    """Depths of all landmarks of a world, in all frames that show them."""
+    """Depths of all landmarks of a world in all of its frames."""
     z = np.concatenate([found.depths(frame) for frame in np.flatnonzero(found.world == world)])
     return z[z > 0]
 
@@ -78,7 +73,7 @@ def _depths(found: Structure, world: int) -> np.ndarray:
 def _fit(
     scene: Scene, world: int, frames: np.ndarray, values: Callable[[int], np.ndarray], config: MonocularConfig
 ) -> LandmarkFit:
-    """Scale and shift of the frames of a world; says how well they fit."""
+    """Fit scale and shift of a world's frames, and report the fit."""
     information = point_information(scene.structure, world, config.pixel_std)
     landmarks = [landmarks_of(scene.structure, frame, information, scene.camera, config.cell) for frame in frames]
     said = []

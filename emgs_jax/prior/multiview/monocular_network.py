@@ -1,4 +1,4 @@
-"""Dense depth by METER, a small network that looks at one image, whose weights the user brings."""
+"""Dense depth by METER, a small monocular network, whose weights the user brings."""
 
 from dataclasses import dataclass
 from functools import lru_cache
@@ -16,7 +16,7 @@ from emgs_jax.prior.pretrained.meter import SOURCE, build_network, predict
 from emgs_jax.prior.pretrained.weights import load_network
 from emgs_jax.structure.model import Structure
 
-NUM_KEPT = 64  # frames whose depths are at hand
+NUM_KEPT = 64  # frames whose depths are cached
 jitted_predict = eqx.filter_jit(predict)
 
 
@@ -24,15 +24,14 @@ jitted_predict = eqx.filter_jit(predict)
 class MeterConfig(MonocularConfig):
     """Depth by METER."""
 
-    # width, height: of the images that it is shown, in pixels; multiples of 64
-    width: int = number(256, low=64, high=4096)
+    width: int = number(256, low=64, high=4096)  # of its input images, a multiple of 64
     height: int = number(192, low=64, high=4096)
     checkpoint: str | None  # path of its weights
-    sha256: str  # of that file, in hexadecimal digits
+    sha256: str  # of that file, hexadecimal
 
 
 def way_of_meter(config: MeterConfig) -> Way:
-    """The way to depth that shows it each image; ValueError where the file is not that of the published weights."""
+    """Depth by METER; ValueError unless the file holds the published weights."""
     network = load_network(config.checkpoint, config.sha256, SOURCE, None, build_network)
 
     def begin(scene: Scene) -> tuple[Structure, Depths]:

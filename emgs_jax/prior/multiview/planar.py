@@ -1,11 +1,10 @@
-"""Planes where texture is missing: a blank region of the image is one plane if the matches on it say so.
+"""Fit planes to regions without texture.
 
-Matching costs of a blank wall are flat, and what semi-global aggregation makes of it is a depth that is extended from
-its border, parallel to the image. But blank regions of rooms are mostly planes, and their borders match well. So each
-blank region gets the plane on which most of its confident matches lie, if these are enough of them (planar priors:
-Gallup, Frahm and Pollefeys, "Piecewise planar and non-planar stereo", CVPR 2010; Xu and Tao, "Planar prior assisted
-PatchMatch multi-view stereo", AAAI 2020). The inverse depth of a plane is linear in the pixel, 1/z = p · (u, v, 1), so
-it is found by RANSAC (Fischler and Bolles, CACM 1981) and least squares, and is as certain as their prediction.
+On a blank wall the matching costs are flat, and semi-global aggregation extends the depth of its border parallel to the
+image. But blank regions of rooms are mostly planes with well matched borders, so each gets the plane of most of its
+confident matches, if these are enough (planar priors: Gallup, Frahm and Pollefeys, CVPR 2010; Xu and Tao, AAAI 2020).
+A plane's inverse depth is linear in the pixel, 1/z = p · (u, v, 1): RANSAC and least squares find it, and its
+uncertainty is that of their prediction.
 """
 
 from collections.abc import Iterator
@@ -20,22 +19,21 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class PlanarConfig:
-    """Detection of blank regions of an image that become planes."""
+    """Detection of blank regions that become planes."""
 
-    # grey value range, image in [0, 1], of the surroundings of a pixel that is blank
-    max_contrast: float = number(0.03, low=0, high=1)
-    radius: int = number(1, low=1, high=64)  # pixels; half the side of these surroundings
-    min_area: int = number(400, low=1)  # pixels of a region
-    max_spread: float = number(1.2, low=0)  # planes of the sweep; matches that are less certain support nothing
+    max_contrast: float = number(0.03, low=0, high=1)  # range of grey values in [0, 1] around a blank pixel
+    radius: int = number(1, low=1, high=64)  # of these surroundings, pixels
+    min_area: int = number(400, low=1)  # of a region, pixels
+    max_spread: float = number(1.2, low=0)  # of a match, in planes of the sweep
     min_matches: int = number(50, low=3)  # of a region
-    tolerance: float = number(1.0, low=0)  # planes of the sweep; matches so near to a plane support it
+    tolerance: float = number(1.0, low=0)  # distance of a supporting match from the plane, in planes of the sweep
     min_share: float = number(0.75, low=0, high=1)  # of a region's matches that must support its plane
-    num_draws: int = number(64, low=1, high=1e6)  # planes through three matches that are tried
-    correlation: float = number(5.0, low=0)  # pixels; errors of matches that are nearer to each other are the same
+    num_draws: int = number(64, low=1, high=1e6)  # of three matches, by RANSAC
+    correlation: float = number(5.0, low=0)  # length over which matches err alike, pixels
 
 
 def blank_regions(gray: Float[np.ndarray, "h w"], config: PlanarConfig) -> Iterator[Bool[np.ndarray, "h w"]]:
-    """The connected regions without texture, each with the surroundings in which its pixels have none."""
+    """The connected regions without texture, each dilated by its pixels' surroundings."""
     around = np.ones((2 * config.radius + 1,) * 2, np.uint8)
     is_blank = cv2.dilate(gray, around) - cv2.erode(gray, around) < config.max_contrast
     count, labels, statistics, _ = cv2.connectedComponentsWithStats(is_blank.astype(np.uint8), connectivity=4)
@@ -47,17 +45,12 @@ def blank_regions(gray: Float[np.ndarray, "h w"], config: PlanarConfig) -> Itera
 def fit_plane(
     pixels: Float[np.ndarray, "n 3"], inverse: Float[np.ndarray, "n"], config: PlanarConfig
 ) -> tuple[Float[np.ndarray, "3"], Bool[np.ndarray, "n"]]:
-    """The plane on which most matches lie, and which these are.
-
-    Args:
-        pixels: (u, v, 1) of the matches.
-        inverse: their inverse depths, in planes of the sweep.
-    """
+    """Find the plane of most matches at `pixels` (u, v, 1) with inverse depths `inverse`, and these matches."""
     draws = np.random.default_rng(0).integers(len(pixels), size=(config.num_draws, 3))
     planes = np.einsum("dij,dj->di", np.linalg.pinv(pixels[draws]), inverse[draws])
     on_plane = np.abs(planes @ pixels.T - inverse) <= config.tolerance
     chosen = on_plane[on_plane.sum(axis=1).argmax()]
-    for _ in range(2):  # least squares of those that support it, then of those that support that
+    for _ in range(2):  # least squares of its supporters, then of the supporters of that
         plane = np.linalg.lstsq(pixels[chosen], inverse[chosen])[0]
         chosen = np.abs(pixels @ plane - inverse) <= config.tolerance
     return plane, chosen
@@ -66,9 +59,9 @@ def fit_plane(
 def _prediction_std(
     at: Float[np.ndarray, "m 3"], pixels: Float[np.ndarray, "n 3"], errors: Float[np.ndarray, "n"], config: PlanarConfig
 ) -> Float[np.ndarray, "m"]:
-    """Standard deviation, in planes of the sweep, of a fitted plane at other pixels: σ² (1 + xᵀ (XᵀX / c²)⁻¹ x).
+    """Standard deviation of a fitted plane at other pixels, by the variance σ² (1 + xᵀ (XᵀX / c²)⁻¹ x).
 
-    c² matches, the square of the correlation length, count as one. Inf where the matches lie on a line.
+    c² matches, the square of the correlation length, count as one. Inf if the matches lie on a line.
     """
     variance, hessian = np.mean(errors**2), pixels.T @ pixels / config.correlation**2
     if np.linalg.cond(hessian) > 1e9:
@@ -83,13 +76,9 @@ def fill_planes(
     spacing: float,
     config: PlanarConfig,
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Depth (m) and spread, with those of a blank region's plane where that is the more certain one.
+    """Depth (0 where unknown) and spread, replaced by those of a blank region's plane where it is more certain.
 
-    Args:
-        depth: m, 0 where it is not known.
-        spread: its uncertainty in planes of the sweep.
-        gray: the image, in [0, 1].
-        spacing: 1/m between the planes of the sweep.
+    Spreads are in planes of the sweep, which are `spacing` (1/m) apart.
     """
     height, width = depth.shape
     v, u = np.mgrid[:height, :width]

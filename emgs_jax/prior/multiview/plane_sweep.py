@@ -1,4 +1,4 @@
-"""Plane sweep: how well each inverse depth of a pixel is confirmed by other images (Collins, CVPR 1996)."""
+"""Plane sweep: the matching cost of each inverse depth of a pixel in other images (Collins, CVPR 1996)."""
 
 import equinox as eqx
 import jax
@@ -14,14 +14,11 @@ class SweepConfig(eqx.Module):
     """Planes and the matching cost."""
 
     num_planes: int = static(64, low=2, high=4096)  # inverse depths that are tried
-    # of the sources, how many confirm a plane: the others may not see the point
-    num_best: int = static(2, low=1, high=64)
-    census_radius: int = static(4, low=1, high=32)  # half the side of the window that is compared
-    census_spacing: int = static(2, low=1, high=32)  # of which every `census_spacing`-th row and column is used
-    # grey value difference, image in [0, 1], below which two pixels count as equal
-    census_margin: Float[Array, "*b"] = traced(0.01, low=0, high=1)
-    # of a plane that leads out of a source's image; a random match costs about .5
-    unseen_cost: Float[Array, "*b"] = traced(0.5, low=0)
+    num_best: int = static(2, low=1, high=64)  # sources that confirm a plane; the others may not see the point
+    census_radius: int = static(4, low=1, high=32)  # half the side of the compared window
+    census_spacing: int = static(2, low=1, high=32)  # between the window's rows and columns in use
+    census_margin: Float[Array, "*b"] = traced(0.01, low=0, high=1)  # difference of equal grey values, in [0, 1]
+    unseen_cost: Float[Array, "*b"] = traced(0.5, low=0)  # outside of a source's image; a random match costs about .5
 
     def __check_init__(self) -> None:
         if len(_taps(self)) > 32:
@@ -34,11 +31,9 @@ def _taps(config: SweepConfig) -> list[tuple[int, int]]:
 
 
 def census(gray: Float[Array, "h w"], config: SweepConfig, scale: int = 1) -> UInt32[Array, "h w"]:
-    """One bit per neighbour: is it brighter than the pixel (Zabih and Woodfill, ECCV 1994)? Survives exposure changes.
+    """Census transform (Zabih and Woodfill, ECCV 1994): a bit for each neighbour that is brighter than the pixel.
 
-    Args:
-        gray: in [0, 1].
-        scale: spacing of the neighbours in pixels of `gray` is that many times the config's.
+    `scale` multiplies the neighbours' spacing.
     """
     reach = scale * config.census_radius
     height, width = gray.shape
@@ -52,7 +47,7 @@ def census(gray: Float[Array, "h w"], config: SweepConfig, scale: int = 1) -> UI
 
 
 def _double(gray: Float[Array, "h w"]) -> Float[Array, "h2 w2"]:
-    """The image at twice the resolution: pixel (2y, 2x) is pixel (y, x), those between are means."""
+    """Double the resolution: pixel (2y, 2x) is pixel (y, x), those between are means."""
 
     def along(image: Array) -> Array:
         following = jnp.concatenate([image[1:], image[-1:]])
@@ -67,7 +62,7 @@ def inverse_depths(near: Float[Array, ""], far: Float[Array, ""], config: SweepC
 
 
 def smallest(values: Float[Array, "s h w"], count: int) -> Float[Array, "k h w"]:
-    """The least `count` of each pixel's values, in order: by exchanges, as a sort of so few costs ten times as much."""
+    """The `count` smallest values of each pixel in order, by exchanges: a tenth of the cost of a sort."""
     rows = list(values)
     count = min(count, len(rows))
     for done in range(count):
@@ -79,15 +74,9 @@ def smallest(values: Float[Array, "s h w"], count: int) -> Float[Array, "k h w"]
 def sweep(
     gray: Float[Array, "h w"], sources: Sources, planes: Float[Array, "d"], camera: Camera, config: SweepConfig
 ) -> Float[Array, "h w d"]:
-    """Matching cost of every plane at every pixel, 0 (all comparisons agree) to 1.
+    """Matching cost of every plane (inverse depth) at every pixel, from 0 (all comparisons agree) to 1.
 
-    The codes of the sources are taken at half a pixel's resolution, without interpolation.
-
-    Args:
-        gray: the view, in [0, 1].
-        sources: likewise.
-        planes: inverse depths, 1/m.
-        camera: of all views.
+    Images are in [0, 1]. The codes of the sources are looked up at half a pixel's resolution, without interpolation.
     """
     reference = census(gray, config)
     codes = jax.vmap(lambda image: census(_double(image), config, scale=2))(sources.views)

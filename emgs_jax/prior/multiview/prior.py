@@ -1,14 +1,11 @@
 """The prior `multiview_stereo`: classical geometry from the images alone, without weights and without a GPU.
 
-COLMAP finds the poses of all images at once (`structure/`); a plane sweep against some of the other views the depth of
-each, and the matches on a blank region its plane (`swept.py`), or a network whose weights the user has (`learned.py`).
-Or the depths are those of a network that looks at one image at a time, in files, brought to the scale of COLMAP's
-landmarks (`depth_files.py`, `monocular.py`). The confidence of a depth is one over the standard deviation of log z
-(`depth_noise.py`), and 1 where nothing is known.
+COLMAP finds the poses of all images (`structure/`). Depth is from a plane sweep, with planes in blank regions
+(`swept.py`), from a stereo network (`learned.py`), or from a monocular network or files, fitted to COLMAP's landmarks
+(`monocular.py`). Its confidence is one over the standard deviation of log z (`depth_noise.py`), at least 1.
 
-Every model of COLMAP is a world with a frame and a unit of its own: images do not tell the scale, so its landmarks get
-the median depth `median_depth`. An answer has the poses of its current frame's world. A frame between two of one world
-may have a pose that is a guess: it has no points, so it is never fused.
+Every model of COLMAP is a world with its own frame and unit: its landmarks get the median depth `median_depth`. A
+prediction has the poses of the current frame's world. A frame with an interpolated pose has no points: it is not fused.
 """
 
 from collections.abc import Sequence
@@ -40,12 +37,12 @@ from emgs_jax.structure.model import NONE, Structure
 from emgs_jax.structure.sequence import structure_of
 
 jitted_difference = eqx.filter_jit(mean_difference)
-NUM_KEPT = 64  # frames whose depths are at hand
+NUM_KEPT = 64  # frames whose depths are cached
 AnyDense = SweptConfig | LearnedConfig | DepthFilesConfig | MeterConfig
 
 
 def way_of(config: AnyDense) -> Way:
-    """The way to a view's depth that a config is for."""
+    """The method that a config belongs to."""
     if isinstance(config, DepthFilesConfig):
         return way_of_files(config)
     if isinstance(config, MeterConfig):
@@ -55,15 +52,16 @@ def way_of(config: AnyDense) -> Way:
 
 
 def _described(config: AnyDense, way: Way) -> dict:
-    """Settings without paths, which digest or contents stand for."""
-    left_out = "folder", "checkpoint"
-    return {key: value for key, value in _values(config).items() if key not in left_out} | dict(way.contents)
+    """Settings without paths, which are identified by a digest."""
+    paths = "folder", "checkpoint"
+    return {key: value for key, value in _values(config).items() if key not in paths} | dict(way.contents)
 
 
 def _values(config: StructureConfig | DenseConfig) -> dict:
-    """Return the values of a config as JSON holds them: a device's .1 is .1 again, and infinity is null."""
-    given = jax.tree.map(lambda v: float(str(np.float32(v))) if isinstance(v, jax.Array) else v, asdict(config))
-    return jsonable(given)
+    """The values of a config for JSON; a float32 of .1 becomes .1."""
+    return jsonable(
+        jax.tree.map(lambda v: float(str(np.float32(v))) if isinstance(v, jax.Array) else v, asdict(config))
+    )
 
 
 class MultiviewStereo(Prior):
@@ -82,11 +80,7 @@ class MultiviewStereo(Prior):
         return window_size
 
     def check(self, dataset: Dataset, window_size: int) -> None:
-        """Take the data set whose images the structure is made of.
-
-        Raises:
-            ValueError: it has fewer than three images, or the depths are not of them.
-        """
+        """Take the data set; ValueError if it has fewer than three images, or the depths are not of them."""
         if len(dataset) < 3:
             raise ValueError(
                 f"prior=multiview_stereo needs three images or more of one place, {dataset.name} {dataset.sequence} "
@@ -96,21 +90,19 @@ class MultiviewStereo(Prior):
         self._dataset = dataset
 
     def keep(self, folder: Path) -> None:
-        """Keep the structure in `folder`/structure, and take it from there; it is made now."""
+        """Make the structure in `folder`/structure, or load it from there."""
         self._folder = folder / "structure"
         self._prepare()
 
     def report(self) -> dict[str, float]:
-        """`prior/placed_percent`: frames with a pose in a model; `prior/num_worlds`: models that hold them."""
+        """`prior/placed_percent`: frames with a pose in a model; `prior/num_worlds`: number of models."""
         if self._found is None:
             return {}
-        return {
-            "prior/placed_percent": 100 * float(self._found.is_placed.mean()),
-            "prior/num_worlds": len(self._found.worlds),
-        }
+        placed = 100 * float(self._found.is_placed.mean())
+        return {"prior/placed_percent": placed, "prior/num_worlds": len(self._found.worlds)}
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Poses of all views and depth of `window.dense`; a view that no model holds has NaN and no valid point."""
+        """Predict; a view that is in no model has NaN and no valid point."""
         self._prepare()
         structure, world = self._found, self._world_at(window.current)
         T, spread = np.full((len(window.views), 4, 4), np.nan), np.full((len(window.views), 6, 6), np.nan)
@@ -126,7 +118,7 @@ class MultiviewStereo(Prior):
         return predicted(window, T, dense, **known)
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
-        """Predict for views of two visits of a place; None where they are not in one world."""
+        """Predict for views of two visits of a place; None unless they are in one world."""
         self._prepare()
         world = self._found.world[[window.views[0], window.current]]
         is_known = world[0] == world[1] != NONE
@@ -147,10 +139,10 @@ class MultiviewStereo(Prior):
             for world in found.worlds
         ]
         self._found, depths = self._way.begin(Scene(self._dataset, found, self._lenses, self._camera))
-        self._depths = lru_cache(NUM_KEPT)(depths)  # what was made of a frame last is asked for again by its neighbours
+        self._depths = lru_cache(NUM_KEPT)(depths)  # a frame's neighbours ask for its depth again
 
     def _world_at(self, frame: int) -> int:
-        """World of a frame; of one that none holds that of the last before which one does, so that nothing changes."""
+        """World of a frame, or of the last frame before it that has one."""
         placed = np.flatnonzero(self._found.world[: frame + 1] != NONE)
         return int(self._found.world[placed[-1]]) if len(placed) else 0
 
@@ -166,11 +158,10 @@ class MultiviewStereo(Prior):
         return points_shown(np.where(mask, depth, 0.0), lens), confidence, mask
 
     def _scale_std(self, frame: int) -> np.float64 | None:
-        """That of a frame's depths."""
         return np.float64(self._depths(frame).scale_std) if self._found.is_placed[frame] else None
 
     def _std(self, frame: int) -> np.ndarray:
-        """Standard deviation of the logarithm of each depth; inf where there is no telling."""
+        """Standard deviation of the log of each depth; inf where undetermined."""
         config, depths = self._dense, self._depths
         depth, spread, pixels, _ = depths(frame)
         others = placed_beside(self._found, frame)[: config.num_checks]

@@ -13,12 +13,11 @@ class SemiGlobalConfig(eqx.Module):
 
     small_step: Float[Array, "*b"] = traced(0.1, low=0)  # for a change by one plane along a path
     large_step: Float[Array, "*b"] = traced(1.0, low=0)  # for any larger change where the image is flat
-    # grey value difference, image in [0, 1], that halves the penalty of a larger change
-    edge: Float[Array, "*b"] = traced(0.03, low=1e-6)
+    edge: Float[Array, "*b"] = traced(0.03, low=1e-6)  # grey value difference, in [0, 1], that halves `large_step`
 
 
 def _advance(path: Array, cost: Array, large_step: Array, config: SemiGlobalConfig) -> Array:
-    """Cost of the best path to every plane, less the best of the pixel before, which keeps it bounded."""
+    """Cost of the best path to every plane, minus the least cost of the pixel before, so that it stays bounded."""
     best = jnp.min(path, axis=-1, keepdims=True)
     beyond = jnp.full_like(best, jnp.inf)
     nearer = jnp.concatenate([path[..., 1:], beyond], axis=-1)
@@ -28,14 +27,14 @@ def _advance(path: Array, cost: Array, large_step: Array, config: SemiGlobalConf
 
 
 def _downwards(cost: Array, gray: Array, shifts: tuple[int, ...], config: SemiGlobalConfig) -> Array:
-    """Sum over the paths that come from the row above, straight or moved by a column; (h, w, d)."""
+    """Sum (h, w, d) over the paths from the row above, straight or shifted by a column."""
 
     def step(carry: tuple[Array, Array], row: tuple[Array, Array]) -> tuple[tuple[Array, Array], Array]:
         paths, above = carry
         cost_row, gray_row = row
         moved = []
         for path, shift in zip(paths, shifts, strict=True):
-            # The border's column stands in for the one outside.
+            # At the border its own column is taken.
             before, light = (_shift(array, shift) for array in (path, above))
             penalty = config.large_step / (1.0 + jnp.abs(gray_row - light) / config.edge)
             penalty = jnp.maximum(penalty, config.small_step)
@@ -57,7 +56,7 @@ def _shift(array: Array, shift: int) -> Array:
 def aggregate(
     cost: Float[Array, "h w d"], gray: Float[Array, "h w"], config: SemiGlobalConfig
 ) -> Float[Array, "h w d"]:
-    """Mean over eight directions of the cost of the best path that ends at each pixel and plane."""
+    """Mean over eight directions of the cost of the best path to each pixel and plane."""
     total = jnp.zeros_like(cost)
     for shifts, is_sideways in (((-1, 0, 1), False), ((0,), True)):
         view = jnp.swapaxes(cost, 0, 1) if is_sideways else cost

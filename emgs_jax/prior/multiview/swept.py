@@ -20,14 +20,14 @@ jitted_depth = eqx.filter_jit(estimate_depth)
 
 @dataclass(frozen=True, kw_only=True)
 class SweptConfig(MatchedConfig):
-    """Depth by a plane sweep, and blank regions that become planes."""
+    """Depth by a plane sweep, with planes in blank regions."""
 
     depth: DepthConfig = field(default_factory=DepthConfig)
     planar: PlanarConfig = field(default_factory=PlanarConfig)
 
 
 def swept(config: SweptConfig) -> Stereo:
-    """Depth of grey images by a plane sweep; the spread is that of plausible planes, in log z."""
+    """Depth of grey images by a plane sweep; the spread is that of the plausible planes, in log z."""
 
     def prepare(image: np.ndarray, lens: Lens) -> np.ndarray:
         return rectify(np.float32(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)) / 255.0, lens)

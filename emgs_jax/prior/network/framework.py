@@ -1,4 +1,4 @@
-"""MapAnything: what it is given and what it gives, as arrays."""
+"""Inputs and outputs of MapAnything, as arrays."""
 
 import json
 from collections.abc import Mapping, Sequence
@@ -12,66 +12,59 @@ from emgs_jax.features.checkpoint import BACKBONE
 from emgs_jax.ops.ranges import number, one_of
 from emgs_jax.prior.network.resize import Resize, Size, resize_intrinsics
 
-View = dict[str, Any]  # of the framework: `img`, `data_norm_type` and what else the network is told
+View = dict[str, Any]  # of the framework: `img`, `data_norm_type` and further inputs
 MEAN, DEVIATION = (np.float32(rgb)[:, None, None] for rgb in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
-NORM, PATCH = "dinov2", 14  # of these mean and standard deviation of RGB in [0, 1]; sides of the grid are multiples
-DINOV2_CLONE = "facebookresearch_dinov2_main"  # the name that torch.hub gives to its copy of the repository
+NORM, PATCH = "dinov2", 14  # name of that normalisation of RGB in [0, 1]; sides of the grid are multiples of the patch
+DINOV2_CLONE = "facebookresearch_dinov2_main"  # torch.hub's copy of the repository
 DOWNLOAD = "hf download facebook/map-anything-apache --local-dir FOLDER"
 
-USED_OUTPUTS = ("pts3d_cam", "conf", "non_ambiguous_mask", "camera_poses")  # a quarter of what there is
+USED_OUTPUTS = ("pts3d_cam", "conf", "non_ambiguous_mask", "camera_poses")  # a quarter of all
 
 
 class NoAnswerError(ValueError):
-    """The network's answer to a window is none, such as rays that no camera has."""
+    """The network's output for a window is unusable, such as rays that no camera has."""
 
 
 @dataclass(frozen=True)
 class ComputeConfig:
-    """Settings for running a network: device, precision and memory."""
+    """Device, precision and memory of a network."""
 
-    device: str | None = None  # `cuda` or `cpu`; None = cuda where there is one
-    # `bf16`, `fp16` or `float32` on a GPU. A CPU computes in float32.
-    amp: str = one_of("bf16", "fp16", "float32", default="bf16")
+    device: str | None = None  # `cuda` or `cpu`; None: cuda if available
+    amp: str = one_of("bf16", "fp16", "float32", default="bf16")  # on a GPU; a CPU computes in float32
     memory_efficient: bool = True  # run the dense heads in parts
-    # images in such a part; None = what fits into the free memory, on which the last bits of the result then depend
-    minibatch_size: int | None = number(1, low=1)
+    minibatch_size: int | None = number(1, low=1)  # images in a part; None: what fits, so bits depend on free memory
 
 
 class Network(Protocol):
     """A loaded network."""
 
-    described: dict[str, Any]  # goes into the provenance: device, precision, digest of the weights
-    peak_bytes: int  # of the GPU's memory so far; 0 without one
+    described: dict[str, Any]  # for the provenance: device, precision, digest of the weights
+    peak_bytes: int  # of GPU memory so far; 0 without a GPU
 
     def infer(self, views: Sequence[View]) -> list[dict[str, np.ndarray]]:
-        """Return the framework's output of every view, batch axis included."""
+        """The framework's output of every view, with its batch axis."""
         ...
 
 
 @dataclass(frozen=True)
 class ViewOutput:
-    """Part of a network's output for one view that the prior uses."""
+    """A network's output for one view, as far as the prior uses it."""
 
     points: np.ndarray  # camera frame, metres, float32 (h, w, 3) on its grid
-    confidence: np.ndarray  # float32 (h, w); 1 where the network gives none
+    confidence: np.ndarray  # float32 (h, w); 1 if the network gives none
     is_clear: np.ndarray  # bool (h, w), False where the network calls the pixel ambiguous
     T_reference_view: np.ndarray  # camera -> the network's own frame, float64 (4, 4)
 
 
 def build_views(
-    images: Sequence[np.ndarray],
-    intrinsics: Sequence[float],
-    resize: Resize,
-    anchor_is_metric: bool | None,
+    images: Sequence[np.ndarray], intrinsics: Sequence[float], resize: Resize, anchor_is_metric: bool | None
 ) -> list[View]:
-    """Make the framework's views; the first is the anchor.
+    """Make the framework's views from RGB images, uint8, on its grid; the first is the anchor.
 
     Args:
-        images: RGB, uint8, on the network's grid.
-        intrinsics: fx, fy, cx, cy of the frames.
-        resize: from the frames onto the grid.
-        anchor_is_metric: the anchor is given a pose, which is called metric or not; None gives it no pose. Its value
-            has no influence, because the network expresses poses relative to the first view: it is the identity.
+        intrinsics: fx, fy, cx, cy of the frames, before `resize`.
+        anchor_is_metric: give the anchor a pose and call it metric or not; None: no pose. Its value, the identity, has
+            no influence, as the network's poses are relative to the first view.
     """
     matrix, views = resize_intrinsics(intrinsics, resize)[None], []
     for image in images:
@@ -84,7 +77,7 @@ def build_views(
 
 
 def read_output(output: Mapping[str, np.ndarray], grid: Size) -> ViewOutput:
-    """Take what the prior uses, without the batch axis; ValueError where it is not there or not of the grid's size."""
+    """Extract what the prior uses, without the batch axis; ValueError if it is missing or not of the grid's size."""
     missing = [key for key in ("pts3d_cam", "camera_poses") if key not in output]
     if missing:
         raise ValueError(f"the network's output has no {', '.join(missing)}: this version of it is not supported")
@@ -101,12 +94,7 @@ def read_output(output: Mapping[str, np.ndarray], grid: Size) -> ViewOutput:
 
 
 def check_checkpoint(folder: Path | None, hub: Path) -> None:
-    """Raise ValueError where a MapAnything checkpoint cannot be loaded without a network.
-
-    Args:
-        folder: has config.json and model.safetensors.
-        hub: folder of torch.hub, where a clone of DINOv2's code must be.
-    """
+    """Raise ValueError if a checkpoint of MapAnything cannot be loaded offline; `hub` must have a clone of DINOv2."""
     if folder is None:
         raise ValueError(f"prior.checkpoint is not set: download the weights once ({DOWNLOAD}) and name the FOLDER")
     missing = [name for name in BACKBONE if not (folder / name).is_file()]

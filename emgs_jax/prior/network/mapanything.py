@@ -1,10 +1,10 @@
 """MapAnything as a prior.
 
-*Frame.* The network expresses everything in the frame of its first view, which is the anchor, but that view's own pose
-is only approximately the identity. So poses are given out as inv(T_0) T_i, and points stay in their own camera.
+*Frame.* The pose of the network's first view, the anchor, is only about the identity, so poses are inv(T_0) T_i. Points
+stay in their own camera.
 
-*Grid.* Predictions are made on the network's grid and handed out at the frames' pixels, see `resize.at_pixels`. Where
-the data set's `size` is the grid, nothing is resampled.
+*Grid.* Predictions are resampled from the network's grid to the frames' pixels, see `resize.at_pixels`, unless the data
+set's `size` is the grid.
 """
 
 from collections.abc import Callable, Sequence
@@ -42,15 +42,15 @@ from emgs_jax.prior.network.torch_network import load_network
 
 
 class MapAnything(Prior):
-    """A prior that asks MapAnything.
+    """MapAnything as a prior.
 
     Args:
         checkpoint: folder with config.json and model.safetensors.
-        resolution: (width, height) of the network's grid; None = the framework's choice for the frames' aspect.
-        anchor_pose: give the anchor a pose, as the paper does; its value has no influence, that it is there has.
-        anchor_is_metric: call that pose metric; the paper does not say.
+        resolution: (width, height) of the network's grid; None: the framework's choice for the frames' aspect.
+        anchor_pose: give the anchor a pose, as the paper does.
+        anchor_is_metric: call that pose metric, which the paper leaves open.
         max_depth_step: relative depth difference across which nothing is interpolated.
-        load: makes the network; tests put another one here.
+        load: makes the network; tests replace it.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class MapAnything(Prior):
         self.provenance = Provenance("mapanything", self._settings(compute) | self._network.described)
 
     def _settings(self, compute: ComputeConfig) -> dict[str, Any]:
-        """Return what decides the predictions, as it took effect."""
+        """The settings in effect, for the provenance."""
         return {
             "version": 2,
             "anchor_pose": self._anchor_is_metric is not None,
@@ -86,7 +86,7 @@ class MapAnything(Prior):
         }
 
     def report(self) -> dict[str, float]:
-        """Return seconds of an inference (median, first), peak GPU memory (0 without one) and their number, if any."""
+        """Number of inferences, their seconds (median, first) and peak GPU memory; nothing before the first."""
         if not self._seconds:
             return {}
         return {
@@ -97,10 +97,7 @@ class MapAnything(Prior):
         }
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Predict for `frames` (in the order of `window.views`); see the module for frame and grid.
-
-        Where the network has no answer no pixel is valid and all poses but the anchor's are NaN.
-        """
+        """Predict; without a usable output no pixel is valid, and all poses but the anchor's are NaN."""
         size = check_frames(window, frames)
         resize = plan_resize(size, self._resolution or choose_grid(size))
         images = [resize_image(frame.image, resize) for frame in frames]
@@ -127,7 +124,7 @@ class MapAnything(Prior):
 
 
 def _check_keys(resolution: Sequence[int] | None, anchor_pose: bool | str) -> None:
-    """Raise ValueError naming the key that has no sense."""
+    """Raise ValueError, with the key, if a setting makes no sense."""
     if resolution is not None and (len(resolution) != 2 or any(side < PATCH or side % PATCH for side in resolution)):
         raise ValueError(
             f"prior.resolution must be (width, height) in multiples of {PATCH}, or null for the framework's own choice;"
@@ -138,7 +135,7 @@ def _check_keys(resolution: Sequence[int] | None, anchor_pose: bool | str) -> No
 
 
 def check_frames(window: Window, frames: Sequence[Frame]) -> Size:
-    """Return the size of the frames; ValueError where they are not the window's or not of one size."""
+    """The size of the frames; ValueError unless they are the window's and of one size."""
     check_order(window, frames)
     sizes = {frame.image.shape[1::-1] for frame in frames}
     if len(sizes) > 1:

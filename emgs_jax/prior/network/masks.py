@@ -1,8 +1,7 @@
-"""Masks of the usable pixels of a network's output: MapAnything's criteria, on the network's grid.
+"""Mask the usable pixels of a network's output by MapAnything's criteria, on the network's grid.
 
-A pixel is left out where the network calls it ambiguous, where its confidence is among the lowest of its view, and on
-edges. Every part has a neutral value that turns it off.
-Upstream's own functions miss edges where rounding makes a cosine larger than 1.
+A pixel is left out if the network calls it ambiguous, if its confidence is among its view's lowest, and on edges.
+Upstream's functions miss edges where rounding makes a cosine larger than 1.
 """
 
 import math
@@ -20,17 +19,12 @@ SQUARE = np.ones((3, 3), np.uint8)
 
 @dataclass(frozen=True)
 class MaskConfig:
-    """Criteria by which a pixel is left out. Upstream's defaults are in conf/prior/mapanything.yaml."""
+    """Which pixels are left out. Depth edges are left out if they are normal edges too; inf in either keeps all."""
 
-    # 1 leaves out what the network itself calls ambiguous (sky, mirrors), 0 keeps it
-    drop_ambiguous: float = number(1.0, low=0, high=1)
-    # share of a view's pixels, in percent, with the lowest confidence; 0 = none
-    confidence_percentile: float = number(0.0, low=0, high=100)
-    # depth range over 3 × 3 pixels, relative to the depth, above which there is a depth edge
-    max_edge_step: float = number(0.03, low=0, high=math.inf)
-    # angle between neighbouring normals above which there is a normal edge. A pixel is left out where both edges are;
-    # inf in either keeps all
-    max_edge_degrees: float = number(5.0, low=0, high=math.inf)
+    drop_ambiguous: float = number(1.0, low=0, high=1)  # 1: leave out what the network calls ambiguous (sky, mirrors)
+    confidence_percentile: float = number(0.0, low=0, high=100)  # of a view's pixels, those of the lowest confidence
+    max_edge_step: float = number(0.03, low=0, high=math.inf)  # range of depth over 3 × 3 pixels, relative
+    max_edge_degrees: float = number(5.0, low=0, high=math.inf)  # between neighbouring normals
 
 
 def usable(
@@ -39,13 +33,7 @@ def usable(
     is_clear: Bool[np.ndarray, "h w"],
     config: MaskConfig,
 ) -> Bool[np.ndarray, "h w"]:
-    """The mask of one view by itself.
-
-    Args:
-        points: camera frame, metres.
-        confidence: higher is better; one that is the same everywhere is never low.
-        is_clear: what the network does not call ambiguous.
-    """
+    """The usable pixels of one view, from points of its camera and the network's confidence and `is_clear`."""
     is_known = np.isfinite(confidence)
     valid = np.isfinite(points).all(axis=-1) & (points[..., 2] > 0) & is_known
     valid &= is_clear | (config.drop_ambiguous <= 0)
@@ -59,7 +47,7 @@ def usable(
 
 
 def _shifted(image: np.ndarray, shifts: Sequence[tuple[int, int]], mode: str) -> list[np.ndarray]:
-    """What lies so many rows and columns beside every pixel."""
+    """The image shifted by these rows and columns, which are at most 1."""
     height, width = image.shape[:2]
     padded = np.pad(image, [(1, 1), (1, 1)] + [(0, 0)] * (image.ndim - 2), mode=mode)
     return [padded[1 + dy : 1 + dy + height, 1 + dx : 1 + dx + width] for dy, dx in shifts]
@@ -68,10 +56,9 @@ def _shifted(image: np.ndarray, shifts: Sequence[tuple[int, int]], mode: str) ->
 def grid_normals(
     points: Float[np.ndarray, "h w 3"], valid: Bool[np.ndarray, "h w"]
 ) -> tuple[Float[np.ndarray, "h w 3"], Bool[np.ndarray, "h w"]]:
-    """Mean of the unit normals of the four corners that a pixel makes with its direct neighbours.
+    """Mean of the unit normals of a pixel's four corners with its direct neighbours, and whether there is any corner.
 
-    Returns:
-        Unit normals in the frame of the points, towards the camera, zero without a corner; whether there is one.
+    Unit normals in the points' frame, towards the camera; zero without a corner.
     """
     beside = (-1, 0), (0, -1), (1, 0), (0, 1), (-1, 0)
     sides = [other - points for other in _shifted(points, beside, "constant")]
@@ -91,10 +78,7 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 def normal_edges(
     points: Float[np.ndarray, "h w 3"], valid: Bool[np.ndarray, "h w"], max_degrees: float
 ) -> Bool[np.ndarray, "h w"]:
-    """Mark pixels with a normal edge in their 3 × 3 surroundings: an angle above `max_degrees` to a neighbour's normal.
-
-    A pixel without a normal differs from any neighbour that has one.
-    """
+    """Mark pixels with an angle above `max_degrees` between neighbours' normals, or a missing one, within 3 × 3."""
     normals, has_normal = grid_normals(points, valid)
     around = [(dy, dx) for dy in (-1, 0, 1) for dx in (-1, 0, 1)]
     smallest = np.ones(valid.shape)
@@ -107,6 +91,6 @@ def normal_edges(
 def depth_edges(
     depth: Float[np.ndarray, "h w"], valid: Bool[np.ndarray, "h w"], max_step: float
 ) -> Bool[np.ndarray, "h w"]:
-    """Mark valid pixels whose valid 3 × 3 neighbours range in depth over more than `max_step` of the pixel's own."""
+    """Mark valid pixels whose valid 3 × 3 neighbours have a range of depth above `max_step` times the pixel's."""
     highest, lowest = (sign * cv2.dilate(np.where(valid, sign * depth, -np.inf), SQUARE) for sign in (1, -1))
     return valid & (np.subtract(highest, lowest, out=np.zeros_like(highest), where=valid) > max_step * depth)

@@ -1,9 +1,8 @@
-"""From a data set's frames to a network's grid and back: MapAnything's resize-and-crop rule, in NumPy.
+"""Resample between a data set's frames and a network's grid, by MapAnything's resize-and-crop rule.
 
-Sizes are (width, height) and pixel centres are at integers. The frame is scaled until it covers the grid, rounded down
-to whole pixels and cropped about its centre. The network's intrinsics follow the scale, as upstream; the resampling
-follows the rounded size. The network learned with the two as they are, so they stay; at the sides of some grids a ray
-is up to half of a grid pixel beside what the pixel shows: .41 at 1200×680, a third at 640×480.
+Sizes are (width, height), pixel centres are integers. The frame is scaled to cover the grid, rounded down to whole
+pixels and cropped at its centre. As upstream, with which the network was trained, intrinsics follow the scale, pixels
+the rounded size: at the sides of some grids a ray is up to half a pixel off (.41 at 1200×680, a third at 640×480).
 """
 
 import math
@@ -16,29 +15,29 @@ from PIL import Image
 
 Size = tuple[int, int]
 
-LONGER, SHORTER = 518, (168, 252, 294, 336, 392, 518)  # sides of the network's grids; upstream's `fixed_mapping`
+LONGER, SHORTER = 518, (168, 252, 294, 336, 392, 518)  # sides of the grids; upstream's `fixed_mapping`
 
 
 @dataclass(frozen=True)
 class Resize:
-    """Mapping of frames of one size onto a network's grid: scaling, then a crop."""
+    """Scale frames of one size, then crop them to a network's grid."""
 
     frame: Size
-    grid: Size  # size of what the network sees
-    scaled: Size  # size of the frame before the crop
-    corner: tuple[int, int]  # (left, top) pixel of the crop in the scaled frame
+    grid: Size
+    scaled: Size  # of the frame before the crop
+    corner: tuple[int, int]  # (left, top) of the crop in the scaled frame
     scale: float  # of the intrinsics
 
 
 def choose_grid(frame: Size) -> Size:
-    """The grid whose aspect is nearest to that of the frames; all but the widest are there upright, too."""
+    """The grid whose aspect is nearest to the frames'; all but the widest also exist upright."""
     wide = [(LONGER, height) for height in SHORTER]
     grids = [*wide, *((height, width) for width, height in wide[1:])]
-    return min(grids, key=lambda grid: abs(round(grid[0] / grid[1], 3) - frame[0] / frame[1]))  # as upstream's table
+    return min(grids, key=lambda grid: abs(round(grid[0] / grid[1], 3) - frame[0] / frame[1]))  # as upstream rounds
 
 
 def plan_resize(frame: Size, grid: Size) -> Resize:
-    """Scale and crop that bring `frame` onto `grid`; the identity where both are the same."""
+    """Scale and crop `frame` to `grid`; the identity if both are equal."""
     scale = max(grid[0] / frame[0], grid[1] / frame[1]) + 1e-8  # upstream's guard against rounding below the grid
     scaled = math.floor(frame[0] * scale), math.floor(frame[1] * scale)
     corner = round((scaled[0] - grid[0]) / 2), round((scaled[1] - grid[1]) / 2)
@@ -46,7 +45,7 @@ def plan_resize(frame: Size, grid: Size) -> Resize:
 
 
 def resize_intrinsics(intrinsics: Sequence[float], resize: Resize) -> Float32[np.ndarray, "3 3"]:
-    """Camera matrix on the grid of fx, fy, cx, cy on the frame; float32, because the network refuses float64."""
+    """Camera matrix on the grid from fx, fy, cx, cy of the frame; float32, as the network refuses float64."""
     fx, fy, *center = intrinsics
     cx, cy = (
         (c + 0.5) * resize.scale - 0.5 * (size * resize.scale - scaled) - 0.5 - corner
@@ -56,7 +55,7 @@ def resize_intrinsics(intrinsics: Sequence[float], resize: Resize) -> Float32[np
 
 
 def resize_image(image: UInt8[np.ndarray, "h w 3"], resize: Resize) -> UInt8[np.ndarray, "_ _ 3"]:
-    """The frame on the grid: Lanczos where it gets smaller, bicubic where it gets larger, then the crop."""
+    """Resize a frame (Lanczos if it shrinks, else bicubic) and crop it to the grid."""
     method = Image.Resampling.LANCZOS if resize.scale < 1 else Image.Resampling.BICUBIC
     (left, top), (width, height) = resize.corner, resize.grid
     return np.asarray(Image.fromarray(image).resize(resize.scaled, method))[top : top + height, left : left + width]
@@ -65,7 +64,7 @@ def resize_image(image: UInt8[np.ndarray, "h w 3"], resize: Resize) -> UInt8[np.
 def on_grid_of(
     frame: Size, scaled: Sequence[float], corner: Sequence[float]
 ) -> tuple[Float[np.ndarray, " w"], Float[np.ndarray, " h"]]:
-    """Grid column of every column of the frame, grid row of every row; not whole, and beyond the grid where cropped."""
+    """Fractional grid column of every column of the frame, grid row of every row; beyond the grid where cropped."""
     columns, rows = (
         (np.arange(size) + 0.5) * (length / size) - 0.5 - start
         for size, length, start in zip(frame, scaled, corner, strict=True)
@@ -80,21 +79,11 @@ def at_pixels(
     pixels: tuple[Float[np.ndarray, " w"], Float[np.ndarray, " h"]],
     max_depth_step: float,
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Points, confidence and mask on a grid, at pixels that need not be the grid's own.
+    """Resample points (camera frame), confidence and mask of a grid at the grid columns and rows `pixels`.
 
-    The nearest grid pixel decides the mask and the confidence, and beyond the grid the mask is off. The point is
-    interpolated where the four grid pixels around are all valid and of one surface, else it is the nearest one's.
-    Ray and inverse depth are what is interpolated: both are linear on a plane.
-
-    Args:
-        points: camera frame, metres, at the pixels of the grid.
-        confidence: at least 1.
-        mask: True where the point can be used.
-        pixels: grid column of every column that is asked for, and grid row of every row.
-        max_depth_step: relative depth difference above which pixels lie on different surfaces.
-
-    Returns:
-        Where the mask is off, the point is 0 and the confidence 1.
+    Mask and confidence are those of the nearest grid pixel; beyond the grid the mask is off. The point is interpolated
+    (ray and inverse depth, which are linear on a plane) where the four pixels around are valid and differ in depth by
+    at most `max_depth_step`, else it is the nearest. Where the mask is off, the point is 0 and the confidence 1.
     """
     columns, rows = pixels
     height, width = mask.shape
@@ -114,7 +103,7 @@ def at_pixels(
 def _interpolate(
     points: np.ndarray, mask: np.ndarray, columns: np.ndarray, rows: np.ndarray, max_depth_step: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Points (h, w, 3) between the grid's pixels, and where they are defined (h, w); whole pixels need none."""
+    """Points (h, w, 3) between the grid's pixels, and where they are defined (h, w), which whole pixels are not."""
     height, width = mask.shape
     left, top = np.floor(columns).astype(int).clip(0, width - 2), np.floor(rows).astype(int).clip(0, height - 2)
     x, y = (columns - left)[None, :], (rows - top)[:, None]

@@ -1,8 +1,4 @@
-"""MapAnything in torch: arrays in, arrays out, in the precision that was asked for.
-
-Nothing is downloaded, and no parameter keeps a random value. torch and the framework are imported in functions. What
-fails is one message with the file or package and the remedy.
-"""
+"""Run MapAnything in torch, from arrays to arrays. Nothing is downloaded, and no parameter keeps a random value."""
 
 import contextlib
 import hashlib
@@ -30,7 +26,7 @@ from emgs_jax.prior.network.framework import (
 
 
 def import_framework(name: str) -> ModuleType:
-    """A module of torch or of the framework; ValueError with the commands that install it."""
+    """Import a module of torch or of the framework; ValueError, with the commands that install it, if that fails."""
     try:
         return importlib.import_module(name)
     except Exception as error:
@@ -48,11 +44,11 @@ def import_framework(name: str) -> ModuleType:
 
 
 def pretrained(folder: Path) -> Any:
-    """MapAnything with the weights of a checkpoint; ValueError where they are damaged or not exactly its own."""
+    """Load MapAnything with the weights of a checkpoint; ValueError if they are damaged or not exactly its own."""
     models, safetensors = import_framework("mapanything.models"), import_framework("safetensors")
     try:
         return models.MapAnything.from_pretrained(str(folder), strict=True)
-    except (safetensors.SafetensorError, RuntimeError) as error:  # a line for each parameter
+    except (safetensors.SafetensorError, RuntimeError) as error:  # with a line for each parameter
         said = " ".join(str(error).split())[:500]
         raise ValueError(
             f"{folder / 'model.safetensors'} is damaged or no MapAnything's ({said}): repeat {DOWNLOAD}"
@@ -61,11 +57,11 @@ def pretrained(folder: Path) -> Any:
 
 @contextlib.contextmanager
 def offline(torch: ModuleType) -> Iterator[None]:
-    """Let nothing be downloaded: the Hugging Face hub by its switch, torch.hub by loading from its cached clones."""
+    """Prevent downloads: switch the Hugging Face hub offline, and let torch.hub load its cached clones."""
     os.environ["HF_HUB_OFFLINE"] = os.environ["TRANSFORMERS_OFFLINE"] = "1"
     with contextlib.suppress(ImportError):
         constants = importlib.import_module("huggingface_hub.constants")
-        constants.HF_HUB_OFFLINE = True  # it has read the variable if something imported it before
+        constants.HF_HUB_OFFLINE = True  # it has read the variable if it was imported before
     hub = torch.hub
     load, download = hub.load, hub.download_url_to_file
 
@@ -87,9 +83,8 @@ def offline(torch: ModuleType) -> Iterator[None]:
 def _cached_clone(repository: str, hub: Path) -> Path:
     """torch.hub's copy of a repository `owner/name[:reference]`."""
     name, _, reference = repository.partition(":")
-    clones = [
-        hub / f"{name.replace('/', '_')}_{branch}" for branch in ([reference] if reference else ["main", "master"])
-    ]
+    branches = [reference] if reference else ["main", "master"]
+    clones = [hub / f"{name.replace('/', '_')}_{branch}" for branch in branches]
     for clone in clones:
         if (clone / "hubconf.py").is_file():
             return clone
@@ -100,22 +95,13 @@ Call = Callable[[list[View]], list[View]]
 
 
 class TorchNetwork:
-    """A `Network` that runs in torch.
-
-    Args:
-        call: from the views as tensors to the framework's outputs as tensors.
-    """
+    """A `Network` in torch; `call` maps views to the framework's outputs, all as tensors."""
 
     def __init__(self, call: Call, device: str, described: dict[str, Any]) -> None:
         self._call, self._device, self.described, self.peak_bytes = call, device, described, 0
 
     def infer(self, views: Sequence[View]) -> list[dict[str, np.ndarray]]:
-        """Return the outputs in use as arrays.
-
-        Raises:
-            ValueError: the GPU's memory does not suffice.
-            NoAnswerError: no camera fits the rays of a view.
-        """
+        """The used outputs as arrays; ValueError if GPU memory is short, NoAnswerError if no camera fits the rays."""
         torch = import_framework("torch")
         height, width = views[0]["img"].shape[2:]
         with _memory_error(torch, f"{len(views)} images of {width}x{height}"), torch.no_grad():
@@ -133,7 +119,7 @@ class TorchNetwork:
 
 
 def _array(value: Any) -> Any:
-    """The array of a tensor; NumPy has no bfloat16, so every floating-point number becomes a float32."""
+    """A tensor as array; NumPy has no bfloat16, so floating-point numbers become float32."""
     if not hasattr(value, "detach"):
         return value
     value = value.detach().cpu()
@@ -141,7 +127,7 @@ def _array(value: Any) -> Any:
 
 
 def load_network(checkpoint: Path | None, compute: ComputeConfig) -> Network:
-    """Load MapAnything from a local folder; ValueError naming what is not installed, missing or set wrongly."""
+    """Load MapAnything from a local folder; ValueError if something is not installed, missing or set wrongly."""
     torch = import_framework("torch")
     import_framework("torch.hub")
     device = compute.device or best_device(torch, "prior=mapanything", "prior.compute.device")
@@ -158,7 +144,7 @@ def load_network(checkpoint: Path | None, compute: ComputeConfig) -> Network:
             minibatch_size=compute.minibatch_size,
             use_amp=amp != "float32",
             amp_dtype="fp16" if amp == "fp16" else "bf16",
-            apply_mask=False,  # upstream masks every view; masks.py does it for those in use
+            apply_mask=False,  # masks.py masks the views in use
         )
     sha256 = hashlib.sha256(digests.encode()).hexdigest()
     return TorchNetwork(call, device, {"device": device.partition(":")[0], "amp": amp, "checkpoint_sha256": sha256})

@@ -1,10 +1,9 @@
-"""IterMVS: depth of a view by a recurrent network that matches it with others, and how sure it is.
+"""IterMVS: depth of a view, and its confidence, by a recurrent multi-view stereo network.
 
 Wang, Galliani, Vogel and Pollefeys, "IterMVS: Iterative Probability Estimation for Efficient Multi-View Stereo", CVPR
-2022. Features of all images at a half, a quarter and an eighth of their size; at an eighth they are compared at depths
-all over the range, which tells which other view shows the pixel, and begins the hidden state of a GRU; at a quarter the
-GRU sees how well depths around the present one fit, at three scales, and says anew what is probable. Depths are numbers
-from 0 (farthest) to 1 (nearest), linear in 1/z, so the unit of poses and range does not matter.
+2022. At an eighth of the size features are compared at depths all over the range, which gives each source's visibility
+and the initial hidden state of a GRU. At a quarter the GRU sees how well depths around the present one fit, at three
+scales, and updates it. Depths are numbers from 0 (farthest) to 1 (nearest), linear in 1/z, so any unit will do.
 """
 
 import math
@@ -24,7 +23,7 @@ from emgs_jax.prior.pretrained.layers import Conv, chain, convolve, resize, samp
 from emgs_jax.prior.pretrained.weights import Layers, Tensors, layers, read_layers
 from emgs_jax.prior.sources import Sources
 
-FINEST, MIDDLE, COARSEST = 2, 4, 8  # pixels of the image to one of the features
+FINEST, MIDDLE, COARSEST = 2, 4, 8  # image pixels per pixel of the features
 UPDATE, EVALUATION = "iter_mvs.update", "iter_mvs.evaluation"
 MATCHING = {"conv0.conv": {}, "conv1.conv": {"stride": 2}, "conv2.conv": {"stride": 2}}
 MATCHING |= {"conv3": {"expansion": 2}, "conv4": {"expansion": 2}, "conv5": {}}
@@ -40,19 +39,17 @@ class IterMVSConfig(eqx.Module):
     """Sizes with which the weights were trained."""
 
     num_iterations: int = static(4, low=1, high=64)  # of the GRU
-    num_groups: int = static(8, low=1, high=16)  # of channels that are compared by themselves
-    num_initial: int = static(32, low=2, high=256)  # depths all over the range with which it begins
-    # bins on either side of the most probable one over which the depth is averaged
-    window: int = static(4, low=0, high=128)
-    # finest_steps, middle_steps, coarsest_steps: of the depths around the present one that are tried on the features of
-    # a scale, in 1/256 of the range
+    num_groups: int = static(8, low=1, high=16)  # of channels, compared separately
+    num_initial: int = static(32, low=2, high=256)  # depths all over the range
+    window: int = static(4, low=0, high=128)  # bins on either side of the most probable, over which depth is averaged
+    # Offsets of the depths to try around the present one, for each scale of the features, in 1/256 of the range.
     finest_steps: tuple[float, ...] = _steps(-2.0, -0.6666667, 0.6666667, 2.0)
     middle_steps: tuple[float, ...] = _steps(-8.0, -2.6666667, 2.6666667, 8.0)
     coarsest_steps: tuple[float, ...] = _steps(-32.0, 32.0)
 
 
 class Features(NamedTuple):
-    """Of one image, at 1/2, 1/4 and 1/8 of its size."""
+    """Features of one image, at 1/2, 1/4 and 1/8 of its size."""
 
     finest: Float[Array, "*b h2 w2 c2"]
     middle: Float[Array, "*b h4 w4 c4"]
@@ -60,7 +57,7 @@ class Features(NamedTuple):
 
 
 def inverse_between(unit: Array, depth_range: Float[Array, "2"]) -> Array:
-    """0 (farthest) to 1 (nearest) -> 1/z."""
+    """1/z of a depth from 0 (farthest) to 1 (nearest)."""
     near, far = 1.0 / depth_range[0], 1.0 / depth_range[1]
     return far + unit * (near - far)
 
@@ -77,13 +74,9 @@ def correlation(
     camera: Camera,
     num_groups: int,
 ) -> Float[Array, "n h w g"]:
-    """Mean product of the channels of each group, where the source shows the points; zero where it does not.
+    """Mean product of each group's channels, of the pixels' features and those where the source sees their points.
 
-    Args:
-        reference: features of the pixels whose points they are.
-        source: features of the other view.
-        points: in its camera.
-        camera: of its features.
+    Points are in the source's camera, `camera` is that of its features; zero where the source does not see them.
     """
     is_ahead = points[..., 2] > 0
     pixels = camera.focal * points[..., :2] / jnp.where(is_ahead, points[..., 2], 1.0)[..., None] + camera.center
@@ -92,12 +85,7 @@ def correlation(
 
 
 def upsample(values: Float[Array, "h w"], logits: Float[Array, "h w k"]) -> Float[Array, "h2 w2"]:
-    """Each of r×r pixels is a convex combination of nine values around it (Teed and Deng, ECCV 2020).
-
-    Args:
-        values: one for each block of r×r pixels.
-        logits: of the combinations, k = 9 r².
-    """
+    """Upsample r times: each pixel is a convex combination of nine values (Teed and Deng, ECCV 2020); k = 9 r²."""
     (height, width), ratio = values.shape, math.isqrt(logits.shape[-1] // 9)
     padded = jnp.pad(values, 1, mode="edge")
     around = jnp.stack([padded[y : y + height, x : x + width] for y in range(3) for x in range(3)], axis=-1)
@@ -106,7 +94,7 @@ def upsample(values: Float[Array, "h w"], logits: Float[Array, "h w k"]) -> Floa
 
 
 def turn(hidden: Float[Array, "h w c"], seen: Float[Array, "h w i"], gates: Sequence[Conv]) -> Float[Array, "h w c"]:
-    """One step of a convolutional gated recurrent unit: the update's gate, the reset's, and the candidate."""
+    """One step of a convolutional GRU with the gates update, reset and candidate."""
     both = jnp.concatenate([hidden, seen], axis=-1)
     update, reset = (jax.nn.sigmoid(convolve(both, gate)) for gate in gates[:2])
     candidate = jnp.tanh(convolve(jnp.concatenate([reset * hidden, seen], axis=-1), gates[2]))
@@ -119,7 +107,7 @@ def _double(image: Float[Array, "h w c"]) -> Float[Array, "h2 w2 c"]:
 
 @full_precision
 def extract(network: Layers, image: Float[Array, "h w 3"]) -> Features:
-    """Features of an RGB image in [0, 1] whose height and width are multiples of 32."""
+    """Features of an RGB image in [0, 1], whose sides are multiples of 32."""
     image = jax.nn.relu(convolve(2.0 * image - 1.0, network["feature_net.conv1"]))
     scales = []
     for layer in (1, 2, 3):
@@ -136,11 +124,7 @@ def extract(network: Layers, image: Float[Array, "h w 3"]) -> Features:
 
 
 def _match(network: Layers, scale: int, correlation: Float[Array, "n h w g"]) -> Float[Array, "h w n"]:
-    """How well each depth fits its surroundings: down twice, up twice, with what was there added.
-
-    Args:
-        scale: of the features that are compared, 0 for the finest.
-    """
+    """Score of each depth by a small U-Net; `scale` is that of the features, 0 for the finest."""
     convs = layers(network, f"{EVALUATION}.corr_conv1.{scale}", MATCHING)
     full = jax.nn.relu(convolve(correlation, convs[0]))
     half = jax.nn.relu(convolve(full, convs[1]))
@@ -150,7 +134,7 @@ def _match(network: Layers, scale: int, correlation: Float[Array, "n h w g"]) ->
 
 
 def _regress(logits: Float[Array, "h w d"], window: int) -> Float[Array, "h w"]:
-    """The mean of the bins around the most probable one, from 0 to 1; at the ends the last bin counts again."""
+    """Mean of the bins around the most probable one, in [0, 1]; beyond the ends the last bin counts again."""
     probability, last = jax.nn.softmax(logits, axis=-1), logits.shape[-1] - 1
     bins = jnp.clip(jnp.argmax(logits, axis=-1)[..., None] + jnp.arange(-window, window + 1), 0, last)
     weights = jnp.take_along_axis(probability, bins, axis=-1)
@@ -165,7 +149,7 @@ def _initial(
     camera: Camera,
     config: IterMVSConfig,
 ) -> tuple[Float[Array, "h w n"], Float[Array, "s h w"]]:
-    """How well depths all over the range fit, at an eighth of the size, and how far each source shows each pixel."""
+    """Scores of depths all over the range at an eighth of the size, and each source's visibility of each pixel."""
     depths = 1.0 / inverse_between(jnp.linspace(0.0, 1.0, config.num_initial), depth_range)
     camera = downscale(camera, COARSEST)
     points = depths[:, None, None, None] * rays(camera, pixel_grid(camera))
@@ -190,13 +174,10 @@ def _around(
     camera: Camera,
     config: IterMVSConfig,
 ) -> Float[Array, "h w n"]:
-    """How well depths around the present one fit, at a quarter of the size, on the features of three scales.
+    """Scores of depths around the present one at a quarter of the size, on the features of three scales.
 
-    Args:
-        references: features of the view, all at a quarter of its size.
-        sources: and how far each shows each pixel.
-        points: of the view's camera, for each scale.
-        camera: of the images.
+    `references` are resized to a quarter; `sources` come with their visibility; `points` are in the view's camera, for
+    each scale; `camera` is that of the images.
     """
     cameras = [downscale(camera, scale) for scale in (FINEST, MIDDLE, COARSEST)]
 
@@ -221,13 +202,9 @@ def estimate(
     camera: Camera,
     config: IterMVSConfig,
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
-    """Depth z of every pixel, in the unit of poses and range, and how sure it is, from 0 to 1.
+    """Depth z of every pixel, in the poses' unit, and its confidence in [0, 1]; meaningless without a used source.
 
-    Without a source that counts both mean nothing.
-
-    Args:
-        depth_range: nearest and farthest depth.
-        camera: of all images; width and height are multiples of 32.
+    `depth_range` is the nearest and the farthest depth; the images' sides are multiples of 32.
     """
     fits, weights = _initial(network, reference.coarsest, sources, depth_range, camera, config)
     to_depth, to_confidence = (
@@ -261,7 +238,7 @@ def estimate(
 
 
 def build_network(tensors: Tensors) -> Layers:
-    """The network of tensors that are named as in the published file; KeyError names one that is missing."""
+    """Build the network from tensors with the published names; KeyError if one is missing."""
     told: dict[str, dict[str, Any]] = {"feature_net.conv1": {"is_block": True}}
     for name in (f"feature_net.layer{layer}.{block}" for layer in (1, 2, 3) for block in (0, 1)):
         first = {"is_block": True, "stride": 2 if name.endswith("0") else 1}

@@ -1,4 +1,4 @@
-"""Layers of convolutional networks as functions of (height, width, channels), as their weights were trained."""
+"""Layers of convolutional networks on (height, width, channels)."""
 
 from collections.abc import Sequence
 
@@ -11,18 +11,17 @@ from emgs_jax.ops.pytree import static
 
 
 class Conv(eqx.Module):
-    """A convolution whose result is as large as the image, divided by `stride` or multiplied by `expansion`."""
+    """A convolution whose output has the image's size, divided by `stride` or multiplied by `expansion`."""
 
-    # rows, columns, channels of the input (one, where each channel is by itself), channels of the output
-    weight: Float[Array, "y x i o"]
-    bias: Float[Array, "o"]  # of each channel of the output
-    stride: int = static()  # of the result's pixels on the image
-    dilation: int = static()  # pixels between those that are weighed
-    expansion: int = static()  # of the image before: 2 is the transposed convolution of three weights with that stride
+    weight: Float[Array, "y x i o"]  # i = 1 for a depthwise convolution
+    bias: Float[Array, "o"]
+    stride: int = static()
+    dilation: int = static()
+    expansion: int = static()  # 2: a transposed convolution of 3 × 3 weights with stride 2
 
 
 def convolve(image: Float[Array, "*b i"], conv: Conv) -> Float[Array, "*b2 o"]:
-    """Apply a convolution; beyond the image there is zero."""
+    """Apply a convolution with zero padding."""
     reach = [conv.dilation * (size // 2) for size in conv.weight.shape[:2]]
     found = jax.lax.conv_general_dilated(
         image.reshape(-1, *image.shape[-3:]),
@@ -41,10 +40,9 @@ def convolve(image: Float[Array, "*b i"], conv: Conv) -> Float[Array, "*b2 o"]:
 
 
 def _of_phases(weight: Float[Array, "3 3 i o"]) -> Float[Array, "2 2 i p"]:
-    """Weights of the 2×2 pixels that come of one where the image is expanded, whose other pixels would all be zero.
+    """Weights of the 2×2 output pixels of one input pixel in a transposed convolution, without multiplying by zeros.
 
-    Of three weights in a row, those of a pixel of the image and the next: the middle one and none for the first of the
-    two pixels, the first and the last one for the second.
+    Of three weights in a row the first output pixel takes the middle one, the second the first and the last.
     """
     for axis in (0, 1):
         before, at, after = jnp.split(weight, 3, axis)
@@ -54,29 +52,24 @@ def _of_phases(weight: Float[Array, "3 3 i o"]) -> Float[Array, "2 2 i p"]:
 
 
 def chain(image: Float[Array, "*b i"], convs: Sequence[Conv]) -> Float[Array, "*b2 o"]:
-    """Apply one convolution after the other, with a ReLU between them."""
+    """Apply convolutions with a ReLU between them."""
     for conv in convs[:-1]:
         image = jax.nn.relu(convolve(image, conv))
     return convolve(image, convs[-1])
 
 
 def resize(image: Float[Array, "h w c"], size: tuple[int, int]) -> Float[Array, "h2 w2 c"]:
-    """The image at another (height, width), linearly between pixels and without smoothing; edges lie on edges."""
+    """Resize to (height, width), bilinear and without antialiasing; edges lie on edges."""
     return jax.image.resize(image, (*size, image.shape[-1]), "linear", antialias=False)
 
 
 def sample(
     image: Float[Array, "h w c"], pixels: Float[Array, "*b 2"], is_seen: Bool[Array, "*b"]
 ) -> Float[Array, "*b c"]:
-    """Values linearly between the pixels; zero beyond the image, which falls off within a pixel of its edge.
-
-    Args:
-        pixels: (x, y); pixel centres are whole numbers.
-        is_seen: elsewhere there is zero, too.
-    """
+    """Sample bilinearly at pixels (x, y), whose centres are integers; zero beyond the image and unless `is_seen`."""
     height, width, channels = image.shape
     rows = image.reshape(-1, channels)
-    low = jnp.floor(jnp.clip(pixels, -2.0, jnp.asarray([width + 1.0, height + 1.0])))  # whole numbers that fit 32 bits
+    low = jnp.floor(jnp.clip(pixels, -2.0, jnp.asarray([width + 1.0, height + 1.0])))  # integers that fit 32 bits
     share = pixels - low
 
     def corner(dx: int, dy: int) -> Array:

@@ -1,9 +1,9 @@
-"""METER-XXS: depth of a single image by convolutions and a little attention.
+"""METER-XXS: monocular depth by convolutions and a little attention.
 
 Papa, Russo and Amerini, "METER: a mobile vision transformer architecture for monocular depth estimation", IEEE TCSVT
-2023. The image is halved five times by inverted bottlenecks (Sandler et al., CVPR 2018); at the last three sizes each
-pixel of a 2×2 patch also attends to the same pixel of all other patches (Mehta and Rastegari, ICLR 2022); what comes of
-it is doubled three times, with what was there on the way down beside it.
+2023. Inverted bottlenecks (Sandler et al., CVPR 2018) halve the image five times; at the last three sizes each pixel of
+a 2×2 patch attends to the same pixel of all other patches (Mehta and Rastegari, ICLR 2022). A decoder with skip
+connections doubles the result three times.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,13 +20,13 @@ from emgs_jax.prior.pretrained.layers import Conv, chain, convolve
 from emgs_jax.prior.pretrained.weights import NORM_EPSILON, Tensors, layers, read_layers
 
 SOURCE = "https://github.com/lorenzopapa5/METER (MIT), models/build_model_best_nyu_xxs"
-PATCH, HEAD_SIZE = 2, 8  # pixels of a patch's side, channels of an attention's head; as the weights were trained
-HALVING, FIRST_PATCHES = (1, 4, 5, 6), 4  # of the bottlenecks: those that halve, and the first with attention after it
+PATCH, HEAD_SIZE = 2, 8  # side of a patch, channels of an attention head
+HALVING, FIRST_PATCHES = (1, 4, 5, 6), 4  # bottlenecks that halve, and the first with attention after it
 SEPARABLE = ("0.depthwise", "0.pointwise")
 
 
 class Linear(eqx.Module):
-    """A matrix, or of a normalisation its diagonal, and an offset."""
+    """A linear layer, or the diagonal one of a normalisation."""
 
     weight: Float[Array, "*i o"]
     bias: Float[Array, "o"]
@@ -50,7 +50,7 @@ def _normalised(values: Float[Array, "*b c"], norm: Linear) -> Float[Array, "*b 
 
 
 def _attend(tokens: Float[Array, "p n c"], network: Layers, name: str) -> Float[Array, "p n c"]:
-    """A layer of a transformer: each token looks at the others of its row."""
+    """A transformer layer: each token attends to the others of its row."""
     found = _times(_normalised(tokens, network[f"{name}.0.norm"]), network[f"{name}.0.fn.to_qkv"])
     query, key, value = jnp.moveaxis(found.reshape(*found.shape[:2], 3, -1, HEAD_SIZE), 2, 0)
     seen = jax.nn.dot_product_attention(query, key, value)
@@ -60,7 +60,7 @@ def _attend(tokens: Float[Array, "p n c"], network: Layers, name: str) -> Float[
 
 
 def _between_patches(image: Float[Array, "h w c"], network: Layers, name: str) -> Float[Array, "h w c"]:
-    """Convolutions, attention between patches, and convolutions of that beside the image."""
+    """Convolutions, attention between patches, and convolutions of the result and the image."""
     local = _in_turn(image, layers(network, f"{name}.conv1", SEPARABLE))
     found = jax.nn.relu(convolve(jax.nn.relu(local), network[f"{name}.conv2.0"]))
     rows, columns, channels = found.shape[0] // PATCH, found.shape[1] // PATCH, found.shape[2]
@@ -73,10 +73,7 @@ def _between_patches(image: Float[Array, "h w c"], network: Layers, name: str) -
 
 @full_precision
 def predict(network: Layers, image: Float[Array, "h w 3"]) -> Float[Array, "h4 w4"]:
-    """Depth up to a factor, at a quarter of the size, of an RGB image in [0, 1].
-
-    Height and width are multiples of 64; it was trained at 192 and 256.
-    """
+    """Depth up to a factor, at a quarter of the size, of an RGB image in [0, 1]; sides are multiples of 64."""
     first = layers(network, "encoder.conv1", SEPARABLE)
     image, kept = jax.nn.relu(_in_turn(jax.nn.standardize(image, axis=None), first)), []
     for number in range(7):
@@ -95,7 +92,7 @@ def predict(network: Layers, image: Float[Array, "h w 3"]) -> Float[Array, "h4 w
 
 
 def build_network(tensors: Tensors) -> Layers:
-    """The network of tensors that are named as in the published file; KeyError names one that is missing."""
+    """Build the network from tensors with the published names; KeyError if one is missing."""
 
     def separable(name: str, stride: int = 1) -> dict[str, dict[str, Any]]:
         return {f"{name}.0.depthwise": {"stride": stride}, f"{name}.0.pointwise": {"norm": f"{name}.1"}}
@@ -110,9 +107,8 @@ def build_network(tensors: Tensors) -> Layers:
         told |= {f"{name}.conv{n}.0": {"norm": f"{name}.conv{n}.1"} for n in (2, 3)}
     for number in (1, 2, 3):
         name = f"decoder.ups_block_{number}"
-        told |= {f"{name}.conv2d_transpose": {"expansion": 2}} | {
-            f"{name}.end_up_layer.{each}": {} for each in SEPARABLE
-        }
+        told |= {f"{name}.end_up_layer.{each}": {} for each in SEPARABLE}
+        told |= {f"{name}.conv2d_transpose": {"expansion": 2}}
     told |= {"decoder.conv2d_in": {}, "decoder.conv2d_out": {}}
     attention = ("0.norm", "0.fn.to_qkv", "0.fn.to_out.0", "1.norm", "1.fn.net.0", "1.fn.net.3")
     matrices = [f"{name}.transformer.layers.0.{layer}" for name in patches for layer in attention]

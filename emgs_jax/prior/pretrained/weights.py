@@ -1,7 +1,4 @@
-"""Published weights: checked, read without running any code of the file, and put where they belong.
-
-A batch normalisation that follows a convolution is a factor and an offset of each channel, so it becomes part of it.
-"""
+"""Load published weights: check the file, read it without running its code, and fold batch norms into convolutions."""
 
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
@@ -24,17 +21,11 @@ Network = TypeVar("Network")
 def load_network(
     checkpoint: str | None, sha256: str, source: str, key: str | None, build: Callable[[Tensors], Network]
 ) -> Network:
-    """The network of a file as its authors publish it.
+    """Load a network from a file with this SHA-256, as published at `source`; ValueError if it is missing or another.
 
     Args:
-        checkpoint: path of the file.
-        sha256: of the file, in hexadecimal digits.
-        source: where it is published.
-        key: of what was saved, under which the tensors stand; None = they are all.
-        build: the network of its tensors; KeyError names one that is missing.
-
-    Raises:
-        ValueError: there is no such file, or it is another one.
+        key: of the tensors in what was saved; None: at the top.
+        build: makes the network of its tensors; KeyError names a missing one.
     """
     if checkpoint is None or not Path(checkpoint).expanduser().is_file():
         raise ValueError(f"prior.dense.checkpoint={checkpoint} is no file: give the path of {source}")
@@ -52,18 +43,13 @@ def load_network(
 
 
 def conv(
-    part: Tensors,
-    name: str,
-    norm: str | None = None,
-    stride: int = 1,
-    dilation: int = 1,
-    expansion: int = 1,
+    part: Tensors, name: str, norm: str | None = None, stride: int = 1, dilation: int = 1, expansion: int = 1
 ) -> Conv:
-    """The convolution `name`, transposed where it expands, with the batch normalisation `norm` after it."""
+    """The convolution `name`, transposed if it expands, with the batch norm `norm` folded in."""
     weight = np.float64(part[f"{name}.weight"])
     if expansion == 1:
         weight = np.moveaxis(weight, (0, 1), (-1, -2))
-    else:  # that of the expanded image, turned round
+    else:  # transposed
         weight = np.moveaxis(np.flip(weight, range(2, weight.ndim)), (0, 1), (-2, -1))
     bias = np.float64(part.get(f"{name}.bias", np.zeros(weight.shape[-1])))
     if norm is not None:
@@ -76,7 +62,7 @@ def conv(
 
 
 def read_layers(part: Tensors, told: Mapping[str, Mapping[str, Any]]) -> Layers:
-    """Convolutions, each with what `conv` is told of it; `is_block`: it is NAME.conv, and NAME.bn comes after it."""
+    """Convolutions by name, each with options for `conv`; `is_block`: it is NAME.conv, followed by NAME.bn."""
     found = {}
     for name, options in told.items():
         names = (f"{name}.conv", f"{name}.bn") if options.get("is_block") else (name,)
@@ -85,5 +71,5 @@ def read_layers(part: Tensors, told: Mapping[str, Mapping[str, Any]]) -> Layers:
 
 
 def layers(network: Mapping[str, Any], prefix: str, names: Iterable[object]) -> list[Conv]:
-    """Those that are called PREFIX.NAME."""
+    """The layers PREFIX.NAME."""
     return [network[f"{prefix}.{name}"] for name in names]

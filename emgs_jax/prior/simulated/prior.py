@@ -1,24 +1,14 @@
-"""The `simulated` prior: true depth and poses, disturbed the way that a feed-forward model disturbs them.
+"""The `simulated` prior: true depth and poses, disturbed as a feed-forward model errs (docs/simulated.md has a table).
 
-How the disturbances of one inference are put together:
-
-- *Poses.* The walk starts at the middle of `views[1:]`, whose true pose relative to the anchor is multiplied from the
-  right by the window's pose error: the window turns about its middle camera. Each neighbour outward follows by the
-  disturbed relative pose of its pair, `T_a_b · exp(noise)` with a before b, the same one in either direction.
-- *Anchor.* View 0 defines the frame, so its pose is the identity and the walk never includes it. The window's pose
-  error stands between it and all other views, also in the first window, where the anchor is one of the FIFO's images:
-  no disturbance is dropped there. (The other reading, expressing that window relative to its own disturbed view 0,
-  would cancel the window's pose error.) Its geometry, where it is dense, is disturbed like that of any other view.
+- *Poses.* The window's pose error, multiplied from the right, turns the window about the middle of `views[1:]`. From
+  there each neighbour outward follows by the disturbed relative pose of its pair, `T_a_b · exp(noise)` with a before b.
+- *Anchor.* The pose of view 0 is the identity. The window's pose error stands between it and all other views, also in
+  the first window, where the anchor is one of the FIFO's images. Its depth is disturbed like any other.
 - *Scale* multiplies every point and every translation of the inference.
-- *Version 2* is for walks. In version 1 the anchor holds every window, so nothing ever drifts. In version 2 it holds a
-  window only while it is seen: where its view and the window's middle view share less than 5 % of their points, the
-  window's pose error, the same draw as in version 1, is that of a model without a hold: 10 % of the distance per axis
-  and 5°, where version 1 is not larger. And the log-scale takes a random walk on top. All else is version 1.
-- *Depth.* Flying points first, then the product of the smooth warps and the pixel noise, all in the logarithm of the
-  depth: it stays positive and a point stays on the ray of its pixel.
+- *Depth.* First flying points, then smooth warps and pixel noise on the log depth: a point stays on its pixel's ray.
 
-Every random number is drawn from a generator seeded by (seed, stream, inference, frames); what goes on over inferences
-is a sum of the beginning of one stream. So one inference alone gives the same bits as a whole run.
+Every generator is seeded by (seed, stream, inference, frames), and processes over inferences are sums of the start of
+one stream. So one inference alone gives the same bits as a whole run.
 """
 
 import math
@@ -47,7 +37,7 @@ from emgs_jax.prior.simulated.truth import check_frames, no_truth, shared_points
 
 VERSIONS = (1, 2)
 REVISITS = 2**24  # more than any sequence has inferences
-MAX_LEVEL = 100.0  # depths are then off by a factor of twenty; far beyond, nothing is finite
+MAX_LEVEL = 100.0  # depths are then off by a factor of twenty
 
 
 @dataclass(frozen=True)
@@ -58,15 +48,15 @@ class Standard:
     window_translation: float = 0.015
     window_rotation: float = math.radians(0.5)
     autocorrelation: float = 0.9  # of scale and window pose, from one inference to the next
-    min_shared: float = 0.05  # version 2: of the points of anchor and middle view; with less the anchor has no hold
-    shared_tolerance: float = 0.05  # relative difference in depth of what counts as one point
-    shared_columns: int = 80  # points across the image that are looked at
+    min_shared: float = 0.05  # version 2: share of points of anchor and middle view for the anchor to hold the window
+    shared_tolerance: float = 0.05  # relative depth difference of one point
+    shared_columns: int = 80  # points across the image
     unheld_translation: float = 0.1  # of the distance between anchor and middle camera
     unheld_rotation: float = math.radians(5.0)
     scale_walk: float = 0.003  # version 2: step of the log-scale from one inference to the next
     pair_translation: float = 0.01
     pair_rotation: float = math.radians(0.3)
-    image_share: float = 0.7  # of the variance of walk and warp: belongs to the images; the rest to the inference
+    image_share: float = 0.7  # of the variance of walk and warp; the rest belongs to the inference
     warp: tuple[float, ...] = (0.03, 0.01)
     warp_length: tuple[float, ...] = (64.0, 16.0)  # correlation exp(-r²/2ℓ²), at an image width of `reference_width`
     reference_width: float = 640.0
@@ -75,7 +65,7 @@ class Standard:
     flying_share: float = 0.5  # of the pixels within 2 px of such a step
     max_confidence: float = 5.0
     confidence_error: float = 0.03  # log-depth error that divides the confidence's excess over 1 by e
-    confidence_cap: float = 2.0  # times that error; beyond it, more error is not noticed: the confidence is no oracle
+    confidence_cap: float = 2.0  # times that error; a larger one does not lower the confidence
     confidence_edge: float = 1.5
     confidence_noise: float = 0.5
     feature_cosine: float = 0.8  # expected cosine of a feature and the embedding of its class
@@ -85,12 +75,11 @@ class Simulated(Prior):
     """A prior that disturbs the ground truth.
 
     Args:
-        level: 0 gives the exact truth, 1 the standard disturbance; all standard deviations scale with it.
-        seed: a different one gives a different draw of all disturbances.
-        feature_size: width f of the features, used where there are classes.
-        classes: names of the data set's labels (`Dataset.classes`); without them features have width 0.
-        version: 1 = the anchor holds every window, so that nothing drifts; 2 = only windows that it shares points with.
-        confusion: at level 1, the probability of a class to be taken for another one from where it is seen.
+        level: factor of all standard deviations; 0 gives the exact truth.
+        feature_size: width f of the features.
+        classes: names of the data set's labels; without them features have width 0.
+        version: 1: the anchor holds every window, so nothing drifts; 2: only windows that share points with it.
+        confusion: probability at level 1 that a class is taken for another.
     """
 
     def __init__(
@@ -121,7 +110,7 @@ class Simulated(Prior):
         self.provenance = Provenance(name, settings, is_simulated=True)
 
     def check(self, dataset: Dataset, window_size: int) -> None:
-        """Raise ValueError, before any work is done, where the data set has no truth to disturb."""
+        """Raise ValueError if the data set has no truth to disturb."""
         if not dataset.has_ground_truth:
             raise ValueError(no_truth(f"{dataset.name} {dataset.sequence} has none"))
         missing = [index for index in range(len(dataset)) if dataset.pose(index) is None]
@@ -133,17 +122,17 @@ class Simulated(Prior):
             )
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Disturb the truth of `frames` (in the order of `window.views`); see the module for how."""
+        """Disturb the truth of `frames`."""
         return self._answer(window, frames, intrinsics, window.inference)
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """As `predict`, with noise of its own: the step that integrates the last view has the same number."""
+        """Likewise with other noise than the step of the same number."""
         return self._answer(window, frames, intrinsics, REVISITS * (1 + window.views[0]) + window.inference)
 
     def _answer(
         self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float], draw: int
     ) -> PriorPrediction:
-        """The answer whose noise beside scale and window pose, which go on over inferences, is number `draw`."""
+        """Predict with noise number `draw`; scale and window pose are processes over inferences."""
         compared = () if self.version == 1 else (window.views[0], window.views[_middle(window)])
         by_index = check_frames(window, frames, {*window.dense, *compared})
         drift = autoregressive(self.seed, window.inference, self.standard.autocorrelation, 7)
@@ -158,7 +147,7 @@ class Simulated(Prior):
         return predicted(window, T_anchor_view, views, features)
 
     def _is_held(self, anchor: Frame, middle: Frame, intrinsics: Sequence[float]) -> bool:
-        """Test whether the anchor shares enough surface with the window's middle view to constrain the window."""
+        """Test whether the anchor shares enough points with the window's middle view."""
         noise = self.standard
         shared = shared_points(anchor, middle, intrinsics, noise.shared_tolerance, noise.shared_columns)
         return shared >= noise.min_shared
@@ -166,14 +155,7 @@ class Simulated(Prior):
     def _poses(
         self, window: Window, truth: Sequence[np.ndarray], drift: np.ndarray, is_held: bool, draw: int
     ) -> np.ndarray:
-        """Return the disturbed camera -> anchor poses (v, 4, 4), before the scale.
-
-        Args:
-            truth: T_world_camera of the window's views.
-            drift: (6,), of unit variance: the window's pose error.
-            is_held: by the anchor.
-            draw: number of its noise.
-        """
+        """The disturbed camera -> anchor poses (v, 4, 4) before the scale; `drift` (6,) is the window's pose error."""
         noise, views = self.standard, window.views
         T_true = np.linalg.inv(np.asarray(truth[0], np.float64)) @ np.asarray(truth, np.float64)
         T_out = np.tile(np.eye(4), (len(views), 1, 1))
@@ -193,14 +175,14 @@ class Simulated(Prior):
         return T_out
 
     def _pair(self, window: Window, left: int, T_true: np.ndarray, draw: int) -> np.ndarray:
-        """Return the disturbed relative pose (4, 4) of the views `left` and `left + 1`."""
+        """The disturbed relative pose (4, 4) of the views `left` and `left + 1`."""
         noise, pair = self.standard, window.views[left : left + 2]
         xi = shared_normals((6,), (self.seed, Stream.PAIR, draw, *pair), noise.image_share)
         T_left_right = np.linalg.inv(T_true[left]) @ T_true[left + 1]
         return T_left_right @ rigid(xi, self.level * noise.pair_translation, self.level * noise.pair_rotation)
 
     def _geometry(self, inference: int, frame: Frame, intrinsics: Sequence[float], scale: float) -> DenseView:
-        """Return points (h, w, 3), confidence (h, w) and mask (h, w) of one view."""
+        """Points, confidence and mask of one view."""
         depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0), frame.depth, 0).astype(np.float32)
         mask = depth > 0
         flown, near_edge = self._flying(inference, frame.index, depth)
@@ -211,7 +193,7 @@ class Simulated(Prior):
         return backproject(disturbed, intrinsics).astype(np.float32), confidence, mask
 
     def _log_noise(self, inference: int, index: int, shape: tuple[int, int]) -> np.ndarray:
-        """Return warp plus pixel noise of the log depth at level 1, float32 (h, w)."""
+        """Warp plus pixel noise of the log depth at level 1, float32 (h, w)."""
         noise = self.standard
         total = noise.pixel * normals(shape, (self.seed, Stream.PIXEL, inference, index))
         for number, (sigma, length) in enumerate(zip(noise.warp, noise.warp_length, strict=True)):
@@ -220,37 +202,34 @@ class Simulated(Prior):
         return total
 
     def _flying(self, inference: int, index: int, depth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the depth with flying points and the mask of the pixels within 2 px of a depth step, both (h, w)."""
+        """The depth with flying points and the mask of the pixels within 2 px of a depth step, both (h, w)."""
         near_edge = edge_band(depth, self.standard.edge_step)
         window = np.ones((5, 5), np.uint8)
         low = -cv2.dilate(np.where(depth > 0, -depth, -np.inf).astype(np.float32), window)
         high = cv2.dilate(depth, window)
-        chance, between = np.random.default_rng((self.seed, Stream.FLYING, inference, index)).random(
-            (2, *depth.shape), np.float32
-        )
+        rng = np.random.default_rng((self.seed, Stream.FLYING, inference, index))
+        chance, between = rng.random((2, *depth.shape), np.float32)
         flies = near_edge & (chance < self.standard.flying_share * min(1.0, self.level))
-        # At the unused pixels `low` may be infinite; they get a neutral value before the arithmetic.
-        low = np.where(flies, low, 0)
+        low = np.where(flies, low, 0)  # infinite where no pixel is valid
         return np.where(flies, low + between * (high - low), depth), near_edge
 
     def _confidence(self, inference: int, index: int, error: np.ndarray, near_edge: np.ndarray) -> np.ndarray:
-        """Return the confidence (h, w) ≥ 1 for the absolute log-depth `error` without the common scale."""
+        """The confidence (h, w) ≥ 1 for the absolute log-depth `error` without the common scale."""
         noise = self.standard
-        # It hides part of the error; above level 1 more of it would hide everything.
+        # The jitter does not grow above level 1, where it would hide all errors.
         jitter = normals(error.shape, (self.seed, Stream.CONFIDENCE, inference, index))
         jitter *= min(1.0, self.level) * noise.confidence_noise
         doubt = np.minimum(error / noise.confidence_error, noise.confidence_cap) + noise.confidence_edge * near_edge
         return (1 + (noise.max_confidence - 1) * np.exp(jitter - doubt)).astype(np.float32)
 
     def _features(self, inference: int, frame: Frame) -> np.ndarray:
-        """Return the noisy unit text embedding of each pixel's label, float16 (h, w, f); zero where there is none."""
+        """The noisy unit text embedding of each pixel's label, float16 (h, w, f); zero without a label."""
         shape, (num_classes, size) = frame.depth.shape, self.text_features.shape
         if frame.labels is None or size == 0:
             return np.zeros((*shape, size), np.float16)
         if frame.labels.max() >= num_classes:
-            raise ValueError(
-                f"frame {frame.index} ({frame.name}) has label {frame.labels.max()} of {num_classes} classes"
-            )
+            label = f"label {frame.labels.max()} of {num_classes} classes"
+            raise ValueError(f"frame {frame.index} ({frame.name}) has {label}")
         # The cosine of e and e + n is 1 / sqrt(1 + |n|²) in expectation, and |n|² = sigma² f.
         sigma = self.level * math.sqrt((self.standard.feature_cosine**-2 - 1) / size)
         share = min(1.0, self.level * self.confusion)
@@ -263,5 +242,5 @@ class Simulated(Prior):
 
 
 def _middle(window: Window) -> int:
-    """Place in `window.views` of the middle of the views after the anchor; of a lone view its own."""
+    """Index in `window.views` of the middle of the views after the anchor; 0 for a single view."""
     return min(1 + (len(window.views) - 1) // 2, len(window.views) - 1)

@@ -1,4 +1,4 @@
-"""The truth that is disturbed: whether the frames of a window have it, and how much of it two views share."""
+"""The truth that is disturbed: check that frames have it, and measure how much of it two views share."""
 
 from collections.abc import Collection, Sequence
 
@@ -14,11 +14,7 @@ def no_truth(what: str) -> str:
 
 
 def check_frames(window: Window, frames: Sequence[Frame], needed: Collection[int]) -> dict[int, Frame]:
-    """Return the frames by index; raise ValueError naming the first one whose truth cannot be used.
-
-    Args:
-        needed: indices of the frames whose depth is looked at.
-    """
+    """The frames by index; ValueError if one has no pose, or one of `needed` no depth."""
     check_order(window, frames)
     for frame in frames:
         label = f"frame {frame.index} ({frame.name})"
@@ -27,34 +23,23 @@ def check_frames(window: Window, frames: Sequence[Frame], needed: Collection[int
         if frame.index in needed and frame.depth is None:
             raise ValueError(no_truth(f"{label} has no depth"))
     if window.inference == 0 and not any((frame.depth > 0).any() for frame in frames if frame.index in needed):
-        raise ValueError(
-            no_truth(
-                f"0 of the first {len(needed)} images, from {frames[0].name} on, have a true depth: it is 0 everywhere"
-            )
-        )
+        first = f"0 of the first {len(needed)} images, from {frames[0].name} on,"
+        raise ValueError(no_truth(f"{first} have a true depth: it is 0 everywhere"))
     return {frame.index: frame for frame in frames}
 
 
 def shared_points(a: Frame, b: Frame, intrinsics: Sequence[float], tolerance: float, num_columns: int) -> float:
-    """Return the share of its points, in 0..1, that the view with the larger share has in common with the other.
+    """Share of the points of a view, in [0, 1], that the other sees, up to a relative depth difference `tolerance`.
 
-    The larger of the two directions: a camera close to a wall that the other one sees from afar shares all of its
-    points, though hardly any of the other's. A view without depth shares nothing. The value is the same for (b, a).
-
-    Args:
-        a, b: with true depth, metres, and true poses.
-        intrinsics: fx, fy, cx, cy in pixels, of both.
-        tolerance: relative difference in depth up to which a point counts as the one that is seen there.
-        num_columns: points across an image, about; rows are as far from each other as columns.
+    The larger of both directions: a camera close to a wall that the other sees from afar shares all of its points.
+    About `num_columns` points across the image are compared. A view without depth shares nothing.
     """
-    return max(
-        _share_seen(one, other, intrinsics, tolerance, max(1, a.depth.shape[1] // num_columns))
-        for one, other in ((a, b), (b, a))
-    )
+    step = max(1, a.depth.shape[1] // num_columns)
+    return max(_share_seen(one, other, intrinsics, tolerance, step) for one, other in ((a, b), (b, a)))
 
 
 def _share_seen(source: Frame, target: Frame, intrinsics: Sequence[float], tolerance: float, step: int) -> float:
-    """Share of the points of every `step`-th pixel of `source` that are the first surface on their ray in `target`."""
+    """Share of the points of every `step`-th pixel of `source` that `target` sees."""
     fx, fy, cx, cy = intrinsics
     z = source.depth[::step, ::step]
     valid = np.isfinite(z) & (z > 0)
