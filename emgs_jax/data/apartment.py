@@ -1,4 +1,4 @@
-"""A furnished apartment to walk through, ray-cast: long walks, loops and what is easily mistaken for a loop."""
+"""A ray-cast, furnished apartment: long walks, loops, and places that look like loops."""
 
 from dataclasses import dataclass
 
@@ -30,23 +30,22 @@ from emgs_jax.data.plan import (
 from emgs_jax.data.raycast import RayCast, Scene
 from emgs_jax.data.walks import RADIUS, WALKS, carry, rounded, table_of
 
-AHEAD = 2.4  # m from the camera to the middle of the way that a person goes to and fro
+AHEAD = 2.4  # m from the camera to the middle of a person's way
 AHEAD_OF_DOOR = 4.0  # m from a door to the camera when it opens
 CHAIR_AT = 0.3  # of the path: where a second lap, or the way back, comes by again
 
-Copies = list[Float[np.ndarray, " 3"]]  # where the copies of a group of objects stand, from where it was built
+Copies = list[Float[np.ndarray, " 3"]]  # offsets of the copies of a group of objects
 
 
 @dataclass(eq=False)
 class Apartment(RayCast):
-    """Six furnished rooms, a hall and a gallery, walked through at eye level.
+    """Six furnished rooms, a hall and a gallery, walked through at eye level; a seed fixes all but the walk.
 
-    Rooms, furniture and colours are the same for every walk of a seed. Without `num_frames` there are some 280 to 560,
-    7 cm apart, less round a corner.
+    Without `num_frames` there are 280 to 560 frames, 7 cm apart, less around corners.
     """
 
-    # two_laps through four rooms; figure_of_eight through a doorway; out_and_back, which sees everything from the other
-    # side; twin_rooms, two that look alike; corridor, which looks the same every 3 m
+    # two_laps through four rooms; figure_of_eight through a doorway; out_and_back, which sees all from the other side;
+    # twin_rooms, two that look alike; corridor, which repeats every 3 m
     walk: str = "two_laps"
 
     name, version = "apartment", 1
@@ -64,7 +63,7 @@ class Apartment(RayCast):
 
 
 def lane_ahead(plan: Plan, camera: Float[np.ndarray, "n 2"]) -> Lane:
-    """The camera's own path. The leaf hangs in the doorway on it that is nearest to its middle, or beside the path."""
+    """The camera's path; a door leaf hangs in the doorway nearest to its middle, or beside the path."""
     walked = np.append(0.0, np.cumsum(np.linalg.norm(np.diff(camera, axis=0), axis=1)))
     gaps = np.linalg.norm(camera[:, None] - [at for _, at in doorways(plan)], axis=-1)
     row = int(np.argmin(gaps.min(axis=1) + 0.02 * np.abs(walked - walked[-1] / 2)))
@@ -87,7 +86,7 @@ def doorways(plan: Plan) -> list[tuple[int, Point]]:
 
 
 def build_apartment(plan: Plan, rng: np.random.Generator) -> Scene:
-    """All objects and their looks; what stands more than once looks the same each time."""
+    """All objects and their looks; copies look alike."""
     lanes = np.concatenate([rounded(walk(plan), RADIUS) for walk in WALKS.values()])
     groups: list[tuple[list[Part], Copies]] = [
         (_rooms(plan, lanes, rng), [np.zeros(3)]),
@@ -106,7 +105,7 @@ def build_apartment(plan: Plan, rng: np.random.Generator) -> Scene:
 
 
 def _rooms(plan: Plan, lanes: Float[np.ndarray, "p 2"], rng: np.random.Generator) -> list[Part]:
-    """Everything that is there once."""
+    """The parts that exist once."""
     f, pictures = furniture, [furniture.picture] * 4
     dining = moved(f.table_with_chairs(rng), np.array([*table_of(plan.dining, 1), 0.0]))
     living = moved(f.low_table(rng), np.array([*table_of(plan.living, -1), 0.0]), np.pi / 2)

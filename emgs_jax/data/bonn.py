@@ -1,4 +1,4 @@
-"""Bonn RGB-D Dynamic: TUM's layout, with a motion capture that follows markers on the sensor in axes of its own."""
+"""Bonn RGB-D Dynamic: TUM's layout, with poses of markers on the sensor in the axes of a motion capture."""
 
 from dataclasses import dataclass
 
@@ -8,9 +8,9 @@ from jaxtyping import Float
 from emgs_jax.data.reading import Number
 from emgs_jax.data.tum import TumLayout
 
-# The authors' transforms: what they call T_g, their world from a point of the camera, is T_ROS^-1 T T_ROS T_M with the
-# markers' pose T of groundtruth.txt. T_M is no rigid motion but has a scale of 1.0593, by which depths fall short of
-# the motion capture's metres; here it stands in `depth_scale`, so that poses stay rigid.
+# The authors' transforms: T_g, world from camera, is T_ROS^-1 T T_ROS T_M with the markers' pose T of groundtruth.txt.
+# T_M has a scale of 1.0593, by which depths fall short of the motion capture's metres; it is in `depth_scale` here, so
+# that poses stay rigid.
 T_ROS = np.array([[-1.0, 0, 0, 0], [0, 0, 1.0, 0], [0, 1.0, 0, 0], [0, 0, 0, 1.0]])  # is its own inverse
 T_M = np.array(
     [
@@ -25,13 +25,13 @@ CALIBRATION = (542.822841, 542.576870, 315.593520, 237.756098), (0.039903, -0.09
 
 @dataclass(eq=False)
 class Bonn(TumLayout):
-    """One sequence of Bonn RGB-D Dynamic, such as "rgbd_bonn_balloon"; lengths are metres of the motion capture."""
+    """One sequence of Bonn RGB-D Dynamic, such as "rgbd_bonn_balloon", in metres of the motion capture."""
 
     depth_scale: Number = 4720.1
 
     name = "bonn"
     source = "Bonn RGB-D Dynamic Dataset, project page of the Photogrammetry and Robotics Lab of the University of Bonn"
-    calibrations = {"": CALIBRATION}  # of one sensor, whatever the sequence is called
+    calibrations = {"": CALIBRATION}  # of all sequences
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
         T_capture_markers = super().pose(index)

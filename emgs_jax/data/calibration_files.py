@@ -1,6 +1,6 @@
-"""Calibration files of other programs: what camera a file is of, pixel centres at integers.
+"""Read calibration files of other programs; pixel centres at integers.
 
-COLMAP and nerfstudio count from the image's corner, so .5 is taken off.
+COLMAP and nerfstudio count from the image's corner, so .5 is subtracted.
 """
 
 import json
@@ -23,7 +23,7 @@ KNOWN_FILES = (
 )
 COEFFICIENTS = {"OPENCV": ("k1", "k2", "p1", "p2", "k3"), "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4")}
 DISTORTION = ("k1", "k2", "p1", "p2", "k3", "k4")  # keys of both
-# What stands in such files beside the camera.
+# Keys in such files beside those of the camera.
 TRANSFORMS_KEYS = {
     *("frames", "ply_file_path", "applied_transform", "applied_scale", "orientation_override", "aabb_scale", "aabb"),
     *("auto_scale_poses_override", "train_filenames", "val_filenames", "test_filenames", "depth_unit_scale_factor"),
@@ -47,11 +47,11 @@ TRANSFORMS_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RA
 
 
 def read_calibration(path: Path) -> Calibration:
-    """The camera in a file of one of the KNOWN_FILES.
+    """Read the camera of one of the KNOWN_FILES.
 
     Raises:
         FileNotFoundError: no such file.
-        ValueError: another format, a model that is not read, an unknown, missing or senseless value.
+        ValueError: another format or camera model, or an unknown, missing or senseless value.
     """
     suffix = path.suffix.lower()
     if suffix not in (".txt", ".bin", ".json", ".yaml", ".yml"):
@@ -79,7 +79,7 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def _only(cameras: list[Calibration], path: Path) -> Calibration:
-    """The camera of a file with one, which it may list several times."""
+    """The only camera of a file, which may list it several times."""
     if not cameras:
         raise ValueError(f"{path} must have lines CAMERA_ID MODEL WIDTH HEIGHT PARAMS, as COLMAP's cameras.txt")
     if len({*cameras}) > 1:
@@ -97,7 +97,7 @@ _Loader.add_constructor(
 
 
 def parse_keys(text: str, path: Path) -> dict[str, Any]:
-    """The keys and values of a JSON or YAML file."""
+    """Parse a JSON or YAML file of keys and values."""
     try:
         if path.suffix.lower() == ".json":
             values = json.loads(text)
@@ -112,7 +112,7 @@ def parse_keys(text: str, path: Path) -> dict[str, Any]:
 
 
 def needed(values: Mapping[str, Any], keys: Collection[str], path: Path) -> list[float]:
-    """The numbers at `keys`, which must be there."""
+    """The numbers at `keys`, which must exist."""
     missing = [key for key in keys if key not in values]
     if missing:
         raise ValueError(f"{path} has no {', '.join(missing)}: add what is missing, in pixels of the images on disk")
@@ -120,7 +120,7 @@ def needed(values: Mapping[str, Any], keys: Collection[str], path: Path) -> list
 
 
 def _check_known(values: Mapping[str, Any], known: Collection[str], path: Path) -> None:
-    """No key that might change the camera goes unread."""
+    """Raise ValueError for unknown keys, which might change the camera."""
     unknown = sorted({str(key) for key in values} - set(known))
     if unknown:
         raise ValueError(
@@ -130,7 +130,7 @@ def _check_known(values: Mapping[str, Any], known: Collection[str], path: Path) 
 
 
 def _lens(values: Mapping[str, Any], model: str, path: Path, before: str = "") -> tuple[float, ...]:
-    """The distortion at the keys k1, k2, …, 0 where one is missing; ValueError where one is of another model."""
+    """The distortion at the keys k1, k2, …, 0 if missing; ValueError if one belongs to another model."""
     found = {key: as_number(values.get(before + key, 0), before + key, path) for key in DISTORTION}
     if foreign := [key for key in found if found[key] and key not in COEFFICIENTS[model]]:
         refuse_model(f"{model} with {', '.join(foreign)}", [*COEFFICIENTS], path)
@@ -139,14 +139,14 @@ def _lens(values: Mapping[str, Any], model: str, path: Path, before: str = "") -
 
 
 def _camera(values: Mapping[str, Any], names: Sequence[str], path: Path, model="OPENCV", before="", corner=0.0):
-    """The camera whose fx, fy, cx, cy, width, height stand at `names`; the first pixel's centre is at `corner`."""
+    """The camera with fx, fy, cx, cy, width, height at the keys `names`; the first pixel's centre is at `corner`."""
     fx, fy, cx, cy, width, height = needed(values, names, path)
     lens = _lens(values, model, path, before)
     return Calibration((fx, fy, cx - corner, cy - corner), lens, size_of(width, height, path), model)
 
 
 def _transforms(values: Mapping[str, Any], path: Path) -> Calibration:
-    """nerfstudio: one camera for all frames."""
+    """Nerfstudio, with one camera for all frames."""
     names = ("fl_x", "fl_y", "cx", "cy", "w", "h")
     camera = {*names, *DISTORTION}
     values = with_frames_camera(values, camera | {"camera_model", "is_fisheye"}, path)
@@ -190,7 +190,7 @@ def kalibr_camera(values: Mapping[str, Any], path: Path) -> Calibration:
 
 
 def numbers_of(value: Any, key: str, path: Path) -> list[float]:
-    """The numbers of a matrix, {rows, cols, data} or nested lists, row by row."""
+    """The numbers of a matrix, {rows, cols, data} or nested lists, by rows."""
     data = value.get("data") if isinstance(value, dict) else value
     if not isinstance(data, list):
         raise ValueError(f"{path}: {key} must have data: [numbers]: correct it")
@@ -199,7 +199,7 @@ def numbers_of(value: Any, key: str, path: Path) -> list[float]:
 
 
 def _mast3r_slam(values: Mapping[str, Any], path: Path) -> Calibration:
-    """width, height, calibration: [fx, fy, cx, cy(, k1, k2, p1, p2(, k3))], as OpenCV takes them."""
+    """MASt3R-SLAM: width, height, calibration: [fx, fy, cx, cy(, k1, k2, p1, p2(, k3))]."""
     _check_known(values, {"width", "height", "calibration"}, path)
     width, height = needed(values, ("width", "height"), path)
     numbers = numbers_of(values["calibration"], "calibration", path)
@@ -225,7 +225,7 @@ def _orb_slam(values: Mapping[str, Any], path: Path) -> Calibration:
 
 
 def _plain(values: Mapping[str, Any], path: Path) -> Calibration:
-    """width, height, fx, fy, cx, cy as ViPE takes them, and maybe the distortion."""
+    """ViPE: width, height, fx, fy, cx, cy, and maybe distortion."""
     names = ("fx", "fy", "cx", "cy", "width", "height")
     _check_known(values, {*names, *DISTORTION}, path)
     return _camera(values, names, path)

@@ -1,7 +1,4 @@
-"""Cameras by COLMAP's models, which pycolmap projects and unprojects; pixel centres at integers, as in OpenCV.
-
-COLMAP counts pixels from the image's corner, so .5 is taken off its principal points.
-"""
+"""COLMAP's camera models, evaluated by pycolmap; pixel centres at integers, so COLMAP's cx, cy are .5 larger."""
 
 import math
 import signal
@@ -16,7 +13,7 @@ from jaxtyping import Float
 
 from emgs_jax.data.reading import Intrinsics, Size
 
-MODELS = {  # the parameters of each, f = fx = fy, in the order of the models' numbers in cameras.bin
+MODELS = {  # parameters by model, f = fx = fy, in the order of the models' numbers in cameras.bin
     "SIMPLE_PINHOLE": "f cx cy",
     "PINHOLE": "fx fy cx cy",
     "SIMPLE_RADIAL": "f cx cy k1",
@@ -38,8 +35,8 @@ MODELS = {  # the parameters of each, f = fx = fy, in the order of the models' n
 }
 PERSPECTIVE = tuple(model for model, names in MODELS.items() if "cx" in names)
 FULL_OPENCV = ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")  # OpenCV's order
-OPENCV_FAMILY = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")  # special cases of it
-LENSES = {  # what ROS, OpenCV, Kalibr and EuRoC call the distortion of a pinhole camera
+OPENCV_FAMILY = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")  # its special cases
+LENSES = {  # names of a pinhole camera's distortion in ROS, OpenCV, Kalibr and EuRoC
     **dict.fromkeys(("", "none", "plumb_bob", "rational_polynomial", "radtan", "radial-tangential"), "OPENCV"),
     **dict.fromkeys(("equidistant", "fisheye"), "OPENCV_FISHEYE"),
     "fov": "FOV",
@@ -51,10 +48,9 @@ class Calibration:
     """A camera."""
 
     intrinsics: Intrinsics  # fx, fy, cx, cy of the images on disk, pixel centres at integers
-    # the other parameters of `model`: of OPENCV k1, k2, p1, p2, maybe k3, and maybe k4, k5, k6; empty for a pinhole
-    # camera
+    # other parameters of `model`: of OPENCV k1, k2, p1, p2(, k3(, k4, k5, k6)); empty for a pinhole camera
     distortion: tuple[float, ...] = ()
-    size: Size | None = None  # (width, height) of the images that it is for; None where nothing says
+    size: Size | None = None  # (width, height) of its images; None if unknown
     model: str = "OPENCV"  # OPENCV for all of OPENCV_FAMILY, else COLMAP's name
 
     @property
@@ -63,7 +59,7 @@ class Calibration:
 
 
 def as_number(value: Any, key: str, where: object) -> float:
-    """A finite number, which YAML may have left as text (1e-3 without a point)."""
+    """A finite number, which YAML may read as text (1e-3 without a point)."""
     try:
         number = math.nan if isinstance(value, bool) else float(value)
     except (TypeError, ValueError):
@@ -90,14 +86,7 @@ def refuse_model(model: object, known: Sequence[str], where: object) -> None:
 def from_colmap(
     model: str, values: Sequence[Any], size: Size | None, where: object, corner: float = 0.5
 ) -> Calibration:
-    """The camera with COLMAP's parameters of a model.
-
-    Args:
-        corner: what the first pixel's centre has in the pixels of `values`.
-
-    Raises:
-        ValueError: no perspective model, or other parameters than it has.
-    """
+    """The camera with COLMAP's parameters of a perspective model; `corner` is the first pixel's centre in `values`."""
     if model not in PERSPECTIVE:
         refuse_model(model, PERSPECTIVE, where)
     names = MODELS[model].split()
@@ -114,7 +103,7 @@ def from_colmap(
 
 
 def lens_of(model: str, coefficients: Sequence[float], where: object) -> tuple[float, ...]:
-    """The distortion of a model; of OPENCV empty where all are 0, and what its longest forms add must be 0."""
+    """The distortion of a model, checked; of OPENCV empty if all are 0, and the ninth and later ones must be 0."""
     if model == "OPENCV":
         if len(coefficients) not in (0, 4, 5, 8, 12, 14) or any(coefficients[8:]):
             raise ValueError(
@@ -129,7 +118,7 @@ def lens_of(model: str, coefficients: Sequence[float], where: object) -> tuple[f
 
 
 def named_lens(name: object, coefficients: Sequence[float], where: object) -> tuple[tuple[float, ...], str]:
-    """Distortion and model of what a program calls its distortion; ValueError for one that is not read."""
+    """Distortion and model by another program's name for it; ValueError if it is unknown."""
     model = LENSES.get(str(name).lower())
     if model is None:
         refuse_model(name, [*filter(None, LENSES)], where)
@@ -137,10 +126,7 @@ def named_lens(name: object, coefficients: Sequence[float], where: object) -> tu
 
 
 def load_pycolmap(otherwise: str) -> ModuleType:
-    """The module, which logs nothing but what ends it; ValueError with these words where it is not installed.
-
-    It takes SIGTERM for itself, to print a stack; whoever listened to it before gets it back.
-    """
+    """Import pycolmap, silence its log and restore the handler of SIGTERM; ValueError if it is not installed."""
     handler = signal.getsignal(signal.SIGTERM)
     try:
         import pycolmap
@@ -153,7 +139,7 @@ def load_pycolmap(otherwise: str) -> ModuleType:
 
 
 def to_pycolmap(camera: Calibration, size: Size) -> Any:
-    """pycolmap's camera, whose pixels have integers at their centres; ValueError where it is not installed."""
+    """pycolmap's camera with pixel centres at integers; ValueError if it is not installed."""
     pycolmap = load_pycolmap(
         "images with lens distortion are straightened by pycolmap, which is not installed (for Linux on ARM there "
         "is no wheel): build it from the source of COLMAP, or undistort the images on another machine"
@@ -167,12 +153,12 @@ def to_pycolmap(camera: Calibration, size: Size) -> Any:
 
 
 def project(camera: Any, rays: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """Pixels of the points x, y at depth 1 before pycolmap's `camera`; nan where it sees none."""
+    """Pixels of points x, y at depth 1 in pycolmap's `camera`; nan where it does not see them."""
     return camera.img_from_cam(np.column_stack([rays, np.ones(len(rays))]))
 
 
 def unproject(camera: Any, pixels: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 2"]:
-    """The points x, y at depth 1 that pycolmap's `camera` shows at pixels; nan where those lie beside or behind it."""
+    """Points x, y at depth 1 that pycolmap's `camera` shows at pixels; nan if they lie beside or behind it."""
     rays = np.asarray(camera.cam_from_img(pixels))
     is_seen = np.abs(project(camera, rays) - pixels).max(axis=1, keepdims=True) < 0.5  # nan is not
     return np.where(is_seen, rays, np.nan)

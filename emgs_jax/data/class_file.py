@@ -1,7 +1,7 @@
-"""Names of classes from a file, and which ids of a data set they stand for.
+"""Read class names, and the ids of a data set that they stand for.
 
-Three layouts are read: a name a line; `id name` or `id,name` a line; and the YAML of OVO's evaluation
-(`class_names_reduced`, `map_to_reduced` and `class_names`). In text `#` begins a comment.
+A file has a name a line; or `id name` or `id,name` a line; or is the YAML of OVO's evaluation (`class_names_reduced`,
+`map_to_reduced` and `class_names`). In text `#` begins a comment.
 """
 
 import os
@@ -22,15 +22,11 @@ class ClassFile:
     """Classes of a file."""
 
     path: str
-    names: tuple[str, ...]  # of the classes, each once
-    # by id of the data set, the position in `names`, -1 = no class; None where the file has no ids
-    positions: Mapping[int, int] | None
+    names: tuple[str, ...]  # distinct
+    positions: Mapping[int, int] | None  # id -> position in `names`, -1 = no class; None if the file has no ids
 
     def positions_of(self, ids: np.ndarray, what: object) -> np.ndarray:
-        """Position in `names` of each id (n,), -1 = no class; ValueError where the file has no ids, or some id no name.
-
-        `what` names the file of the ids in messages.
-        """
+        """Position in `names` of each id (n,), -1 = no class; ValueError, which names `what`, if an id is unknown."""
         if self.positions is None:
             raise ValueError(f"{self.path} has names without ids, which {what} needs: {REMEDY}")
         found, inverse = np.unique(ids, return_inverse=True)
@@ -53,7 +49,7 @@ def _some(numbers: list[int]) -> str:
 
 
 def read_classes(path: str | os.PathLike) -> ClassFile:
-    """Read a class file; raises ValueError, with its name, for one that is not there or is none."""
+    """Read a class file; ValueError if it cannot be read or is none."""
     path = Path(path)
     try:
         text = path.read_text(encoding="utf-8")
@@ -76,7 +72,7 @@ def _of_yaml(text: str) -> tuple[list[str], dict[int, int]]:
     if missing:
         raise ValueError(f"it lacks {', '.join(missing)}")
     names = [_word(name) for name in _checked(list, content["class_names_reduced"], "class_names_reduced")]
-    # OVO leaves out points of classes that the scenes do not have; what has not even a name is an error.
+    # OVO leaves out points of classes that the scenes do not have; an id without a name is an error.
     positions = {number: -1 for number, _ in enumerate(_checked(list, content.get("class_names") or [], "class_names"))}
     for number, position in _checked(Mapping, content["map_to_reduced"], "map_to_reduced").items():
         if not isinstance(number, int) or not isinstance(position, int) or not 0 <= position <= len(names):

@@ -1,4 +1,4 @@
-"""EuRoC MAV, and what has its layout (ASL): images of one camera on a rig, whose motion is known; no depth."""
+"""EuRoC MAV and other data in the ASL layout: one camera on a rig with known motion; no depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -18,10 +18,7 @@ ORDER = (0, 1, 2, 4, 5, 6, 3)  # from x y z qw qx qy qz to TUM's order
 
 @dataclass(eq=False)
 class Euroc(PosedImages):
-    """One camera of one sequence, such as "MH_01_easy", straightened; images of data.csv are in order of time.
-
-    Without state_groundtruth_estimate0 there are no poses.
-    """
+    """One camera of one sequence, such as "MH_01_easy", undistorted; without state_groundtruth_estimate0 no poses."""
 
     size: Sequence[int] = (376, 240)
     camera: str = "cam0"  # "cam0" (left) or "cam1"
@@ -35,7 +32,7 @@ class Euroc(PosedImages):
 
 
 def read_euroc(folder: Path, camera: str, tolerance: float) -> Solved:
-    """The images of a camera and its poses in the world of the ground truth.
+    """Read a camera's images and its true poses.
 
     Raises:
         FileNotFoundError: a file of the layout is missing.
@@ -65,7 +62,7 @@ def read_euroc(folder: Path, camera: str, tolerance: float) -> Solved:
 
 
 def read_sensor(path: Path) -> tuple[Calibration, Pose]:
-    """The camera of a sensor.yaml and T_body_camera, which it calls T_BS."""
+    """Read the camera of a sensor.yaml and T_body_camera, there T_BS."""
     values = parse_keys(reading.layout_text(path, LAYOUT), path)
     if "T_BS" not in values:
         raise ValueError(f"{path} has no T_BS, which a camera of EuRoC has: fetch it again")

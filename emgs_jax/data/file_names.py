@@ -1,4 +1,4 @@
-"""Information in the names of image files: the file that a list means, the order of the files, and their times."""
+"""What names of image files tell: the file that a list means, the order of the files, and their times."""
 
 import itertools
 import math
@@ -18,19 +18,15 @@ DATE = re.compile(r"(?<!\d)(20\d\d)([-_.]?)(\d\d)\2(\d\d)[-_.T ]?(\d\d)([-_.:]?)
 PARTS = re.compile(r"(\d{10})[-_](\d{9})$")  # seconds since 1970 and nanoseconds, as drivers of ROS write them
 DECIMAL = re.compile(r"(.*?)(?<![0-9.])([0-9]+)(?:\.([0-9]+))?$")  # a name that ends with a number
 
-
 MAX_TAKEN = 64  # images whose EXIF is read, evenly spread
-MAX_KINDS, MIN_NUMBERS = 4, 3  # of images in one folder that are told apart by their names
+MAX_KINDS, MIN_NUMBERS = 4, 3  # kinds of images in one folder, and their numbers, to report a mixture
 IMAGE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".webp")
 OTHER_SUFFIXES = (".heic", ".heif", ".avif", ".jxl", ".gif", ".exr", ".hdr", ".ppm", ".pgm", ".dng", ".cr2", ".cr3")
 OTHER_SUFFIXES += (".nef", ".arw", ".raf", ".orf", ".rw2", ".raw")
 
 
 def find_image(folder: Path, name: str) -> Path:
-    """The image that a list in `folder` names: as it stands, with Windows' backslashes, or without its ending.
-
-    Where none of them is there it is the file of that name, which then cannot be read.
-    """
+    """The image that a list in `folder` names, maybe with backslashes or without its ending; it may not exist."""
     endings = "", *IMAGE_SUFFIXES, *map(str.upper, IMAGE_SUFFIXES)
     for written in dict.fromkeys((name, name.replace("\\", "/"))):
         for ending in endings:
@@ -40,7 +36,7 @@ def find_image(folder: Path, name: str) -> Path:
 
 
 def check_one_kind(paths: Sequence[Path]) -> None:
-    """ValueError where images in their order are several of each number: colours and depths, images and masks."""
+    """Raise ValueError if several kinds of images have the same numbers, such as images and masks."""
     numbers = [tuple(re.findall(r"[0-9]+", path.stem)) for path in paths]
     kinds = {re.sub(r"[0-9]+", "#", path.name): path for path in paths}
     repeats = [row for row, pair in enumerate(itertools.pairwise(numbers)) if pair[0] and pair[0] == pair[1]]
@@ -53,7 +49,7 @@ def check_one_kind(paths: Sequence[Path]) -> None:
 
 
 def unread_note(folder: Path) -> str | None:
-    """Words about the pictures of a folder that are of no format that is read."""
+    """Describe pictures in a folder whose format is not read; None if there are none."""
     endings = [path.suffix.lower() for path in folder.iterdir() if not path.name.startswith(".")]
     found = {ending: endings.count(ending) for ending in OTHER_SUFFIXES if ending in endings}
     if not found:
@@ -63,7 +59,7 @@ def unread_note(folder: Path) -> str | None:
 
 
 def is_file(path: Path) -> bool:
-    """Test whether a file exists; False also for a name that no file can have (too long, or with a zero byte)."""
+    """Test whether a file exists; False too for an impossible name (too long, or with a zero byte)."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -71,7 +67,7 @@ def is_file(path: Path) -> bool:
 
 
 def natural_key(path: Path) -> list[list[tuple[int, int, str]]]:
-    """Sort key under which frame2 comes before frame10, and all of a folder before all of the next."""
+    """Sort key that puts frame2 before frame10, and each folder together."""
 
     def key(name: str) -> list[tuple[int, int, str]]:
         parts = re.split(r"([0-9]+)", name.casefold())
@@ -81,10 +77,10 @@ def natural_key(path: Path) -> list[list[tuple[int, int, str]]]:
 
 
 def natural_order(paths: Sequence[Path]) -> tuple[list[int], str | None]:
-    """Rows of image files in natural order, and a note where that is of decimal numbers.
+    """Rows of image files in natural order, and a note if that is the order of decimal numbers.
 
-    A program that writes seconds as they are printed drops zeros at their end: 1.9, 1.93, 2.0 and 2.05, where 05 is
-    less than 1 of 2.1. A counter after a point, of which 1.10 follows 1.9, has such zeros.
+    Seconds without trailing zeros are decimal: 2.05 comes before 2.1. A counter after a point has such zeros: 1.10
+    follows 1.9.
     """
     found = [DECIMAL.fullmatch(path.stem) for path in paths]
     ends = [match and match[3] for match in found]
@@ -105,7 +101,7 @@ def natural_order(paths: Sequence[Path]) -> tuple[list[int], str | None]:
 
 
 def taken_note(paths: Sequence[Path]) -> str | None:
-    """Words where images in their order were taken in another one, as their EXIF says: a counter that began anew."""
+    """Describe where EXIF times go back in the order of the names, as after a reset counter; None if they do not."""
     rows = dict.fromkeys(np.linspace(0, len(paths) - 1, min(len(paths), MAX_TAKEN)).astype(int).tolist())
     taken = [(when, paths[row].name) for row in rows if (when := _taken(paths[row]))]
     back = next(((a[1], b[1]) for a, b in itertools.pairwise(taken) if b[0] < a[0]), None)
@@ -118,7 +114,7 @@ def taken_note(paths: Sequence[Path]) -> str | None:
 
 
 def _taken(path: Path) -> str | None:
-    """DateTimeOriginal and its fraction, which sort as text; None where there is none."""
+    """DateTimeOriginal with its fraction, which sorts as text; None if there is none."""
     if path.suffix.lower() not in (".jpg", ".jpeg"):
         return None
     try:
@@ -131,10 +127,10 @@ def _taken(path: Path) -> str | None:
 
 
 def times_of(paths: Sequence[Path]) -> tuple[list[float], str | None]:
-    """Seconds of image files in their order, and a note where their names are not read as they stand.
+    """Seconds of image files in their order, and a note unless their names are read as they stand.
 
-    They are the numbers in the names where they ascend, else the positions of the files. Of clocks in milliseconds,
-    microseconds or nanoseconds they are seconds (see `unit_of`), and of a date and time of day those since 1970 (UTC).
+    Dates with a time become seconds since 1970 (UTC); ascending numbers become seconds by `unit_of`; else the positions
+    of the files are taken.
     """
     names = [path.stem for path in paths]
     dates = [_date(name) for name in names]
@@ -159,7 +155,7 @@ def last_number(name: str) -> int | float | None:
 
 
 def _back_note(paths: Sequence[Path], times: Sequence[float | None]) -> str | None:
-    """Words where what are times go back in the order of the files; None where they may be other numbers."""
+    """Describe where times go back in the order of the files; None if they may be other numbers."""
     known = [time for time in times if time is not None and time >= MIN_CLOCK]
     if len(known) < len(times):
         return None
@@ -175,7 +171,7 @@ def _ascend(times: Sequence[float | None]) -> bool:
 
 
 def _date(name: str) -> float | None:
-    """Seconds since 1970 of the date and time of day in a name; None where there is none."""
+    """Seconds since 1970 of the date and time in a name; None without one."""
     found = DATE.search(name)
     if found is None:
         return None

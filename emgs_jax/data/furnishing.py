@@ -1,4 +1,4 @@
-"""Placement of furniture: at random along the walls, clear of doorways, of other pieces and of the camera's routes."""
+"""Place furniture at random along walls, clear of doorways, other pieces and the camera's routes."""
 
 from collections.abc import Callable, Iterable
 
@@ -20,12 +20,9 @@ Bounds = Float[np.ndarray, "2 3"]  # lowest and highest corner in the world
 def furnish(
     area: Area, pieces: Iterable[Piece], middle: list[Part], lanes: Float[np.ndarray, "p 2"], rng: np.random.Generator
 ) -> list[Part]:
-    """Place pieces of furniture at random along the walls, around what stands in the middle; return all parts.
+    """Place pieces along the walls in this order, clear of the middle and of routes (x, y); return all parts.
 
-    Args:
-        pieces: placed in this order; one without a free place after TRIES draws is left out.
-        middle: parts in the world, which stay.
-        lanes: points (x, y) of the routes through the room.
+    A piece without a free place after TRIES draws is left out.
     """
     low, high = np.array(area.low) - 1e-6, np.array(area.high) + 1e-6
     parts, taken = [*middle], [*([bounds(middle)] if middle else []), *_doorsteps(area)]
@@ -42,7 +39,7 @@ def furnish(
 
 
 def at_wall(parts: list[Part], area: Area, wall: int, share: float) -> list[Part]:
-    """Furniture built with its back to y = 0, put to a wall at a share of the wall's length."""
+    """Move furniture with its back at y = 0 to a wall, at a share of the wall's length."""
     low, high = np.array(area.low), np.array(area.high)
     place = low + share * (high - low)
     place[wall % 2] = (high if wall in (EAST, NORTH) else low)[wall % 2]
@@ -50,7 +47,7 @@ def at_wall(parts: list[Part], area: Area, wall: int, share: float) -> list[Part
 
 
 def bounds(parts: list[Part]) -> Bounds:
-    """Box around all parts."""
+    """Bounding box of all parts."""
     each = np.array([mesh.bounds for _, mesh in parts])
     return np.stack([each[:, 0].min(axis=0), each[:, 1].max(axis=0)])
 
@@ -73,12 +70,12 @@ def _doorsteps(area: Area) -> list[Bounds]:
 
 
 def _meets(box: Bounds, others: list[Bounds], gap: float) -> Bool[np.ndarray, " n"]:
-    """Test which of the other boxes are nearer than `gap` along every axis: a picture may hang above a sofa."""
+    """Test which other boxes are nearer than `gap` along every axis: a picture may hang above a sofa."""
     low, high = np.array([other[0] for other in others]), np.array([other[1] for other in others])
     return ((box[0] - gap < high) & (low < box[1] + gap)).all(axis=-1) if others else np.zeros(0, bool)
 
 
 def _distance(points: Float[np.ndarray, "p 2"], box: Bounds) -> float:
-    """From the nearest of the points to the box, seen from above; 0 inside."""
+    """Horizontal distance of the nearest point from the box; 0 inside."""
     outside = np.maximum(np.maximum(box[0, :2] - points, points - box[1, :2]), 0.0)
     return float(np.linalg.norm(outside, axis=-1).min())

@@ -36,7 +36,7 @@ def moved(parts: list[Part], offset: Float[np.ndarray, " 3"], angle: float = 0.0
 
 
 def against(parts: list[Part], wall: int, size: Float[np.ndarray, " 3"], along: float) -> list[Part]:
-    """Furniture built at the origin with its back to y = 0, put to one of the walls +x, +y, -x, -y."""
+    """Move furniture with its back at y = 0 to one of the walls +x, +y, -x, -y."""
     angle = wall * np.pi / 2
     out, side = np.array([np.cos(angle), np.sin(angle), 0]), np.array([-np.sin(angle), np.cos(angle), 0])
     return moved(parts, out * size[wall % 2] / 2 + side * along, angle + np.pi / 2)

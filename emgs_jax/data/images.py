@@ -21,11 +21,10 @@ LAYOUT = (
 
 @dataclass(eq=False)
 class Images(Straightened):
-    """Your own images, in natural order of their names, or a video; sequence None = root itself is folder or file."""
+    """Your own images, in natural order of their names, or a video; sequence None: root is the folder or file."""
 
-    # required. fx, fy, cx, cy in pixels of the images on disk, where they are distorted followed by k1, k2, p1, p2 and
-    # maybe k3; the name of a model of COLMAP and its parameters; or a calibration file, "exif" or "estimate", see
-    # `intrinsics.find_lens`
+    # Required: fx, fy, cx, cy in pixels of the images on disk, maybe with k1, k2, p1, p2(, k3); a model of COLMAP and
+    # its parameters; a calibration file; "exif" or "estimate", see `intrinsics.find_lens`.
     intrinsics: Given | None = None
 
     name, layout, source = "images", LAYOUT, "your own recording"
@@ -79,7 +78,7 @@ class Images(Straightened):
 
 
 def listed(folder: Path) -> tuple[list[Path], list[float], list[str | None]]:
-    """The images of a folder in natural order, the times in their names (`times_of`), and notes on both."""
+    """Images of a folder in natural order, the times in their names (`times_of`), and notes on both."""
     if not folder.is_dir():
         raise ValueError(f"{folder} is neither a folder nor a video file; expected {LAYOUT}")
     found = [p for p in folder.iterdir() if p.suffix.lower() in IMAGE_SUFFIXES and not p.name.startswith(".")]

@@ -1,4 +1,4 @@
-"""Frames of several data sets as one, in one camera that shows what all of theirs show."""
+"""Join data sets into one, in a camera that shows what all of theirs show."""
 
 import hashlib
 from collections.abc import Iterable, Sequence
@@ -14,11 +14,7 @@ from emgs_jax.data.reading import Intrinsics, Size, check_index
 
 
 class JoinedFrames(Dataset):
-    """One data set after the other, none with a lens to straighten.
-
-    Args:
-        has_truth: the true poses of all are in one world; False: they are left out.
-    """
+    """One data set after the other; without `has_truth` true poses, which are in several worlds, are left out."""
 
     def __init__(self, parts: Sequence[Dataset], has_truth: bool = True) -> None:
         self.name, self.sequence = (joined_name(getattr(one, key) for one in parts) for key in ("name", "sequence"))
@@ -54,16 +50,12 @@ class JoinedFrames(Dataset):
 
 
 def joined_name(names: Iterable[object]) -> str:
-    """The names, each once."""
+    """The distinct names, joined."""
     return "+".join(dict.fromkeys(map(str, names)))
 
 
 def common_camera(cameras: Sequence[tuple[Size, Intrinsics]]) -> tuple[Size, Intrinsics]:
-    """Camera with the focal lengths of the first that shows what all of them show, as large as fits.
-
-    Raises:
-        ValueError: they show nothing in common.
-    """
+    """The camera of the first one's focal lengths that shows all that they have in common; ValueError if nothing."""
     (first, (fx, fy, *_)), sides = cameras[0], []
     for size, (*focal, cx, cy) in cameras:
         sides.append([((edge - 0.5 - c) / f) for c, f, n in zip((cx, cy), focal, size, strict=True) for edge in (0, n)])
@@ -77,7 +69,7 @@ def common_camera(cameras: Sequence[tuple[Size, Intrinsics]]) -> tuple[Size, Int
 
 
 def resampled(frame: Frame, of: Intrinsics, to: Intrinsics, size: Size) -> Frame:
-    """A frame as another camera at the same place shows it: colours between pixels, all else of the nearest one."""
+    """Resample a frame for another camera at the same place, colours bilinearly, all else by the nearest pixel."""
     x, y = (
         ((np.arange(count) - to[axis + 2]) / to[axis] * of[axis] + of[axis + 2]).astype(np.float32)
         for axis, count in enumerate(size)

@@ -1,4 +1,4 @@
-"""KITTI odometry: rectified images of a car, and the motion of its left grey camera; no depth."""
+"""KITTI odometry: rectified images from a car, and the motion of its left grey camera; no depth."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -19,12 +19,12 @@ SOURCE = "KITTI odometry benchmark: colour images, calibration files and ground 
 
 @dataclass(eq=False)
 class Kitti(PosedImages):
-    """One camera of one sequence of KITTI odometry below root, which has sequences/ and poses/; 11 to 21 have no poses.
+    """One camera of one sequence below root, which has sequences/ and poses/; 11 to 21 have no poses.
 
-    The world is that of poses/00.txt: the left grey camera at the first image of the sequence.
+    The world is the left grey camera at the first image.
     """
 
-    sequence: str | int | None = None  # "00"; of 7 the two digits 07
+    sequence: str | int | None = None  # "00"; 7 means 07
     size: Sequence[int] = (480, 144)
     camera: int = 2  # 0 and 1 are grey, 2 and 3 in colour, left and right
 
@@ -38,13 +38,11 @@ class Kitti(PosedImages):
 
 
 def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
-    """The images of a camera and its poses.
-
-    `truth` has those of camera 0; a poses.txt in `folder` does as well, and without either there is none.
+    """Read a camera's images and its poses, from those of camera 0 in `truth` or in poses.txt of `folder`, if any.
 
     Raises:
         FileNotFoundError: a file of the layout is missing.
-        ValueError: it is damaged, or lists do not have a row for every image.
+        ValueError: it is damaged, or a list has not a row for every image.
     """
     images = folder / f"image_{camera}"
     if not images.is_dir():
@@ -65,7 +63,7 @@ def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
 
 
 def read_rows(path: Path, count: int) -> list[str]:
-    """The lines of a list that has one for every image."""
+    """Read a list with a line for every image."""
     rows = reading.layout_text(path, f"{LAYOUT} ({SOURCE})").rstrip().splitlines()
     if len(rows) != count:
         raise ValueError(f"{path} has {len(rows)} lines for {count} images: fetch the sequence and this file again")
@@ -73,7 +71,7 @@ def read_rows(path: Path, count: int) -> list[str]:
 
 
 def read_projection(path: Path, key: str) -> tuple[Calibration, Float[np.ndarray, "4 4"]]:
-    """The camera with the projection K [I | t] of calib.txt, and its pose T_first_camera beside the left grey one."""
+    """The camera with projection K [I | t] in calib.txt, and its pose T_first_camera relative to the left grey one."""
     text = reading.layout_text(path, f"{LAYOUT} ({SOURCE})")
     lines = dict(line.split(":", 1) for line in text.splitlines() if ":" in line)
     if key not in lines:
@@ -87,7 +85,7 @@ def read_projection(path: Path, key: str) -> tuple[Calibration, Float[np.ndarray
 
 
 def pose_of(row: str, where: str, T_first_camera: Pose) -> Pose | None:
-    """T_world_camera of a row of twelve numbers, the upper part of that of camera 0; None where it is inf or nan."""
+    """T_world_camera from twelve numbers, the upper part of camera 0's pose; None if inf or nan."""
     if len(row.split()) != 12:
         raise BadFrameError(f"{where} {row[:80]!r} must be 12 numbers, the upper part of a pose: fetch the file again")
     pose = reading.as_pose(f"{row} 0 0 0 1", where, may_be_far=True)

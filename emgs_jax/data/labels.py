@@ -1,4 +1,4 @@
-"""Images of classes: an id per pixel, and the file that says what the ids mean."""
+"""Class images: an id per pixel, and a file that names the ids."""
 
 from collections.abc import Collection, Sequence
 from dataclasses import replace
@@ -14,16 +14,15 @@ from emgs_jax.data.class_file import read_classes
 
 
 class LabelFolder:
-    """Class images in a folder, each with the name of the image that it is of.
+    """Class images in a folder, named like their images: PNG of ids with one channel, 8 or 16 bits.
 
     Args:
-        folder: of PNG images of ids with one channel, 8 or 16 bits.
-        classes: file that names them, see `data.class_file`; names without ids count from 0.
-        unknown: ids that mean that there is no class, also where they have a name; None: 0, unless it has one.
-        key: where a user says `unknown`; "" = nowhere.
+        classes: file that names the ids, see `data.class_file`; names without ids count from 0.
+        unknown: ids that mean no class, named or not; None: 0, unless it has a name.
+        key: of the config for `unknown`, for messages.
 
     Raises:
-        ValueError: the folder or the file is not there, or the file names no classes, or an id twice.
+        ValueError: folder or file are missing, or the file names no classes or an id twice.
     """
 
     def __init__(self, folder: Path, classes: Path, unknown: Collection[int] | None = None, key: str = "") -> None:
@@ -40,17 +39,11 @@ class LabelFolder:
         self._largest_id = max(self._known.positions or ())
 
     def path(self, image: str | Path) -> Path:
-        """The file of an image's classes."""
+        """The class image of an image."""
         return self.folder / f"{Path(image).stem}.png"
 
     def read(self, image: str | Path, raw_size: tuple[int, int] | None = None) -> Int32[np.ndarray, "h w"]:
-        """Position in `names` of each pixel of the image, -1 where there is no class.
-
-        The image's name is looked for; `raw_size` is the (width, height) that it must have.
-
-        Raises:
-            BadFrameError: the file cannot be read, is no image of ids or of another size, or has an id without a name.
-        """
+        """Read the position in `names` of each pixel, -1 = no class; BadFrameError if the file cannot be used."""
         path = self.path(image)
         ids = reading.decode(path, cv2.IMREAD_UNCHANGED)
         if ids.ndim != 2 or ids.dtype not in (np.uint8, np.uint16):
@@ -68,7 +61,7 @@ class LabelFolder:
 
 
 def as_unknown(unknown: Sequence[int] | None, key: str) -> tuple[int, ...] | None:
-    """The ids of a config, None where it leaves them open; a ValueError names `key` where one is no whole number."""
+    """Check ids from the `key` of a config; None if it has none."""
     if unknown is None:
         return None
     is_list = isinstance(unknown, Sequence) and not isinstance(unknown, str)

@@ -1,4 +1,4 @@
-"""Procedural solid textures of the built-in scenes: every object has two colours and a pattern of the position."""
+"""Procedural solid textures of the built-in scenes: two colours an object, mixed by a pattern of the position."""
 
 import colorsys
 from dataclasses import dataclass, replace
@@ -9,27 +9,25 @@ from scipy.ndimage import map_coordinates
 
 from emgs_jax.data.furniture import Part
 
-NOISE_CELLS = 32  # the noise repeats after this many texture scales
+NOISE_CELLS = 32  # period of the noise, in texture scales
 PATTERNS = ("noise", "stripes", "checker")
 
 
 @dataclass(frozen=True)
 class Looks:
-    """Texture of every object: colours `low` and `high` are mixed by a pattern of the world position."""
+    """Textures of objects: a pattern of the world position mixes the colours `low` and `high`, RGB in 0..1."""
 
-    # low, high: RGB in 0..1
     low: Float[np.ndarray, "n 3"]
     high: Float[np.ndarray, "n 3"]
     scale: Float[np.ndarray, " n"]  # metres of one noise cell
     pattern: Int[np.ndarray, " n"]  # row of PATTERNS
-    offset: Float[np.ndarray, "n 3"]  # where in the noise the object begins
-    # where in the world, in metres, the texture is attached: copies of an object that stand apart look alike
-    origin: Float[np.ndarray, "n 3"]
-    noise: Float[np.ndarray, "s s s"]  # random values of the lattice, wraps around
+    offset: Float[np.ndarray, "n 3"]  # of the object in the noise
+    origin: Float[np.ndarray, "n 3"]  # of the texture in the world, metres, so that copies look alike
+    noise: Float[np.ndarray, "s s s"]  # random lattice, wraps around
 
 
 def draw_looks(parts: list[Part], rng: np.random.Generator) -> Looks:
-    """A random look for every object; hues step by the golden ratio so that no two are alike."""
+    """Draw a look for every object; hues step by the golden ratio, so that no two are alike."""
     hues = (rng.uniform() + 0.618034 * np.arange(len(parts))) % 1.0
     is_shell = np.array([name in ("wall", "ceiling") for name, _ in parts])
     saturation = np.where(is_shell, 0.3, rng.uniform(0.45, 0.75, len(parts)))
@@ -50,7 +48,7 @@ def draw_looks(parts: list[Part], rng: np.random.Generator) -> Looks:
 
 
 def copied(looks: Looks, rows: Int[np.ndarray, " c"], shifts: Float[np.ndarray, "c 3"]) -> Looks:
-    """Looks of copies of the objects `rows` that are shifted by (x, y, z) metres in the world."""
+    """Looks of copies of the objects `rows`, shifted by metres in the world."""
     each = {field: getattr(looks, field)[rows] for field in ("low", "high", "scale", "pattern", "offset", "origin")}
     return replace(looks, **{**each, "origin": each["origin"] + shifts})
 
@@ -58,7 +56,7 @@ def copied(looks: Looks, rows: Int[np.ndarray, " c"], shifts: Float[np.ndarray, 
 def paint(
     points: Float[np.ndarray, "p 3"], normals: Float[np.ndarray, "p 3"], objects: Int[np.ndarray, " p"], looks: Looks
 ) -> UInt8[np.ndarray, "p 3"]:
-    """RGB of points in the world on the given objects; matt, so that a point has one colour from everywhere."""
+    """RGB of world points on the given objects; matt, so that it does not depend on the view."""
     points = points - looks.origin[objects]
     cells = points / looks.scale[objects, None] + looks.offset[objects]
     grain = 0.65 * _noise(cells, looks) + 0.35 * _noise(2.3 * cells + 17.0, looks)
@@ -68,7 +66,7 @@ def paint(
     shape = np.choose(looks.pattern[objects], [4.0 * (grain - 0.5), stripes, 1.6 * checker])
     mix = np.clip(0.5 + 0.35 * np.tanh(1.8 * shape) + 0.9 * (grain - 0.5), 0, 1)
     color = looks.low[objects] + mix[:, None] * (looks.high - looks.low)[objects]
-    patches = 0.75 + 0.5 * _noise(points / 0.7 + 5.0, looks)  # large spots tell one tile of a pattern from the next
+    patches = 0.75 + 0.5 * _noise(points / 0.7 + 5.0, looks)  # large spots distinguish the tiles of a pattern
     light = 0.72 + 0.28 * np.abs(normals @ np.array([0.48, 0.36, 0.8]))
     return (255 * np.clip(color * (patches * light)[:, None], 0, 1) + 0.5).astype(np.uint8)
 

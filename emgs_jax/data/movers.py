@@ -1,6 +1,6 @@
-"""Things that move in the built-in scenes: people who walk, chairs that are moved between two visits, doors that open.
+"""Moving things in the built-in scenes: people who walk, chairs that change places, doors that open.
 
-Where each is depends on the image's place along the camera's path only. z is up; metres, radians.
+Their places depend only on the image's position along the camera's path. z is up; metres, radians.
 """
 
 from dataclasses import dataclass
@@ -13,9 +13,9 @@ from emgs_jax.data import furniture
 from emgs_jax.data.base import ELSEWHERE, MOVES, STAYS
 from emgs_jax.data.furniture import Part
 
-CLASSES = ("person", "chair", "door")  # in this order a scene gets them
-SPEED = 0.5  # m/s of the camera: what gives its images a time
-STRIDE, PERIOD = 1.0, 4.0  # a person goes to and fro about a point that keeps its distance from the camera
+CLASSES = ("person", "chair", "door")  # in the order in which a scene gets them
+SPEED = 0.5  # m/s of the camera, which gives its images times
+STRIDE, PERIOD = 1.0, 4.0  # of a person who goes to and fro, ahead of the camera
 ASIDE = 0.45  # m from the lane to a second person, and to a chair
 CHAIR_SHIFT = 0.8  # m from its old place to its new one
 SWING, SWING_TIME = np.radians(100.0), 2.0  # of a door
@@ -23,7 +23,7 @@ SWING, SWING_TIME = np.radians(100.0), 2.0  # of a door
 
 @dataclass(frozen=True)
 class Doorway:
-    """Where a leaf hangs: its hinge, and the direction of the leaf from there while it is shut."""
+    """The hinge of a door leaf, the direction of the shut leaf from there, and its width."""
 
     hinge: tuple[float, float]
     shut: float
@@ -32,17 +32,17 @@ class Doorway:
 
 @dataclass(frozen=True)
 class Lane:
-    """A line that is free to walk on."""
+    """A line that is free to walk on; distances are along it."""
 
-    line: Float[np.ndarray, "m 2"]  # its points; the first again at the end where it is closed
-    walked: Float[np.ndarray, " n"]  # distance along it of the camera, for each image
-    lead: float  # distance along it from the camera to what it looks at
-    chair: float  # distance along it to the old place of a chair
-    doorway: Doorway  # and from which image on the leaf swings open
-    opens: int
+    line: Float[np.ndarray, "m 2"]  # points; a closed line ends with its first
+    walked: Float[np.ndarray, " n"]  # distance of the camera, for each image
+    lead: float  # distance from the camera to what it looks at
+    chair: float  # distance of a chair's old place
+    doorway: Doorway
+    opens: int  # image from which on the leaf swings open
 
     def at(self, distance: Float[np.ndarray, " k"], aside: float = 0.0) -> Float[np.ndarray, "k 2"]:
-        """Points so far along the line and to its left; an open line goes straight on beyond its ends."""
+        """Points at distances along the line and to its left; an open line is extended straight."""
         ends = np.cumsum(np.linalg.norm(np.diff(self.line, axis=0), axis=1))
         along = np.concatenate([[0.0], ends])
         if np.allclose(self.line[0], self.line[-1]):
@@ -56,22 +56,21 @@ class Lane:
 
 @dataclass(frozen=True)
 class Mover:
-    """One thing and where it is."""
+    """A moving thing."""
 
-    part: Part  # class and mesh, in axes of its own
+    part: Part  # class and mesh, in its own axes
     poses: Float[np.ndarray, "n 4 4"]  # T_world_mover of each image
-    # of each image: MOVES, ELSEWHERE (it stands, not where it stays in the end) or STAYS
-    states: UInt8[np.ndarray, " n"]
+    states: UInt8[np.ndarray, " n"]  # of each image: MOVES, ELSEWHERE (before its final place) or STAYS
 
 
 def build_movers(count: int, lane: Lane, rng: np.random.Generator) -> list[Mover]:
-    """`count` things: a person, a chair and a door, then a second person, and so on."""
+    """Build a person, a chair, a door, then a second person, and so on."""
     builders = (_person, _chair, _door)
     return [builders[number % 3](lane, number // 3, rng) for number in range(count)]
 
 
 def _person(lane: Lane, number: int, rng: np.random.Generator) -> Mover:
-    """A person of 1.7 m who goes to and fro where the camera looks."""
+    """A person of 1.7 m who walks to and fro where the camera looks."""
     seconds = lane.walked / SPEED
     phase = 2 * np.pi * seconds / (PERIOD * (1.0 + 0.3 * number)) + rng.uniform(0, 2 * np.pi)
     place = lane.at(lane.walked + lane.lead + STRIDE * np.sin(phase), ASIDE * number)
@@ -83,7 +82,7 @@ def _person(lane: Lane, number: int, rng: np.random.Generator) -> Mover:
 
 
 def _chair(lane: Lane, number: int, rng: np.random.Generator) -> Mover:
-    """A chair that stands elsewhere in the second half of the path."""
+    """A chair that moves after the first half of the path."""
     distance, yaw = lane.chair + 0.9 * number, rng.uniform(0, 2 * np.pi)
     before, after = lane.at(np.array([distance, distance + CHAIR_SHIFT]), -ASIDE)
     is_moved = np.arange(len(lane.walked)) >= len(lane.walked) / 2
@@ -92,7 +91,7 @@ def _chair(lane: Lane, number: int, rng: np.random.Generator) -> Mover:
 
 
 def _door(lane: Lane, number: int, rng: np.random.Generator) -> Mover:
-    """A leaf that swings open once; each further one hangs in the same frame and opens a little later."""
+    """A leaf that swings open once; further ones hang in the same frame and open later."""
     door, seconds = lane.doorway, lane.walked / SPEED
     opened = (seconds - seconds[lane.opens]) / SWING_TIME - 0.5 * number
     share = np.clip(opened, 0.0, 1.0)

@@ -6,9 +6,8 @@
     ───d────┬───d─────┬─────────────┘
      study  │ bedroom │
 
-Living and dining room have a doorway between them, study and bedroom too, so that one can walk round. The hall goes
-past two rooms that are the same, `APART` metres from each other, as are the pieces of the hall before them, and ends in
-the gallery, whose bays are all the same.
+Doorways join living and dining room, and study and bedroom, so that one can walk round. The hall passes two equal rooms
+`APART` metres from each other, with equal pieces of hall before them, and ends in the gallery of equal bays.
 """
 
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ import trimesh
 
 from emgs_jax.data.furniture import Part, box, join, moved
 
-WALL = 0.06  # thickness; two rooms that meet have a wall each, back to back, so that every side has its own look
+WALL = 0.06  # thickness; adjacent rooms have a wall each, so that every side has its own look
 HEIGHT = 2.6
 DOOR_WIDTH, DOOR_HEIGHT = 1.3, 2.1
 HALF_HALL = 0.9
@@ -32,12 +31,11 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class Area:
-    """A rectangle of floor."""
+    """A rectangle of floor from `low` to `high`."""
 
-    # low, high: its corners (x, y)
     low: Point
     high: Point
-    walls: tuple[int, ...] = (EAST, NORTH, WEST, SOUTH)  # sides that have a wall; the others are open
+    walls: tuple[int, ...] = (EAST, NORTH, WEST, SOUTH)  # the other sides are open
     doors: tuple[tuple[int, float], ...] = ()  # (wall, x or y of the middle) of the doorways
 
 
@@ -45,24 +43,20 @@ class Area:
 class Plan:
     """The areas and the points that walks go through."""
 
-    # living, dining, study, bedroom: rooms of four different sizes at the hall's west end
-    living: Area
+    living: Area  # this and the next three are the rooms at the hall's west end
     dining: Area
     study: Area
     bedroom: Area
-    twin: Area  # the western of the two equal rooms; `twin_bay` is the piece of hall before it
-    twin_bay: Area
-    # hall, corner: the rest of the hall; the corner joins it to the gallery
-    hall: Area
-    corner: Area
-    bay: Area  # the first of the gallery's bays; `end` closes it behind the last one
-    end: Area
-    # north_door, south_door: middle of the doorways living–dining and study–bedroom
-    north_door: Point
-    south_door: Point
-    # west, east: x of the doorways from the hall to living and study, and to dining and bedroom
-    west: float
-    east: float
+    twin: Area  # the western of the two equal rooms
+    twin_bay: Area  # the piece of hall before it
+    hall: Area  # the rest of the hall
+    corner: Area  # joins the hall to the gallery
+    bay: Area  # the first of the gallery
+    end: Area  # closes the gallery
+    north_door: Point  # middle of the doorway living–dining
+    south_door: Point  # of study–bedroom
+    west: float  # x of the doorways from the hall to living and study
+    east: float  # to dining and bedroom
 
     @property
     def twin_door(self) -> float:
@@ -71,7 +65,7 @@ class Plan:
 
 
 def draw_plan(rng: np.random.Generator) -> Plan:
-    """A random plan: the sizes of the rooms and where their doorways are."""
+    """Draw the sizes of the rooms and their doorways."""
     near = HALF_HALL + 2 * WALL  # |y| at which rooms begin
     (living_w, dining_w, study_w, bedroom_w, twin_w), (living_d, dining_d, study_d, bedroom_d, twin_d) = rng.uniform(
         ((5.6, 5.2, 4.4, 5.3, 5.0), (4.4, 4.8, 3.6, 4.0, 4.5)), ((6.0, 5.6, 4.9, 5.7, 5.4), (4.7, 5.1, 3.9, 4.3, 4.8))
@@ -104,7 +98,7 @@ def draw_plan(rng: np.random.Generator) -> Plan:
 
 
 def shell(area: Area) -> list[Part]:
-    """Floor, ceiling and walls around the area; a wall is two-sided and has its doorways cut out."""
+    """Floor, ceiling and two-sided walls with doorways around an area."""
     low = [end - WALL * (wall in area.walls) for end, wall in zip(area.low, (WEST, SOUTH), strict=True)]
     high = [end + WALL * (wall in area.walls) for end, wall in zip(area.high, (EAST, NORTH), strict=True)]
     parts = join("floor", _slab((*low, -WALL), (*high, 0.0)))
@@ -119,7 +113,7 @@ def shell(area: Area) -> list[Part]:
 
 
 def lining(wall: int, at: Point) -> list[Part]:
-    """Frame of the doorway whose middle is `at` between two walls; it stands 2 cm out of them on both sides."""
+    """Frame of the doorway with middle `at` between two walls; it projects 2 cm on both sides."""
     depth = 2 * WALL + 0.04
     jambs = [box((0.09, depth, DOOR_HEIGHT + 0.06), (s * (DOOR_WIDTH / 2 + 0.015), 0, 0)) for s in (-1, 1)]
     head = box((DOOR_WIDTH - 0.06, depth, 0.09), (0, 0, DOOR_HEIGHT - 0.03))
@@ -127,7 +121,7 @@ def lining(wall: int, at: Point) -> list[Part]:
 
 
 def _pieces(span: Point, doors: list[float]) -> list[tuple[Point, Point]]:
-    """(along, height) intervals of a wall from end to end: full height beside the doorways, above them the rest."""
+    """(along, height) intervals of a wall: full height beside the doorways, the rest above them."""
     edges = [span[0], *(edge for door in doors for edge in (door - DOOR_WIDTH / 2, door + DOOR_WIDTH / 2)), span[1]]
     heights = [(0.0, HEIGHT), (DOOR_HEIGHT, HEIGHT)]
     return [(piece, heights[i % 2]) for i, piece in enumerate(zip(edges[:-1], edges[1:], strict=True))]

@@ -1,4 +1,4 @@
-"""Plausibility of intrinsics for the images, and likely mistakes: those of other images, in another order or unit."""
+"""Check intrinsics for plausibility, and recognise likely mistakes: another image size, order or unit."""
 
 import math
 
@@ -6,21 +6,21 @@ import numpy as np
 
 from emgs_jax.data.reading import Intrinsics, Size, resize_intrinsics
 
-USUAL_VIEW_DEG = 10.0, 150.0  # of lenses that a pinhole camera describes
+USUAL_VIEW_DEG = 10.0, 150.0  # of pinhole cameras
 NARROWEST_VIEW_DEG = 2.0  # of a telescope
-MAX_OFFSET = 0.1  # of the principal point from the middle, of the side; lenses and mounts are off by some per cent
-MAX_ALIKE, ALIKE = 0.04, 0.012  # likewise where it is off by the same share of both sides, as in another resolution
-MAX_SQUEEZE = 0.1  # of fx / fy from 1: pixels are square, but images may have been squeezed
-FIT = 0.03  # another reading of the numbers fits where it comes so near to the middle and to square pixels
+MAX_OFFSET = 0.1  # of the principal point from the middle, as a share of the side
+MAX_ALIKE, ALIKE = 0.04, 0.012  # likewise if both shares are equal, as in another resolution
+MAX_SQUEEZE = 0.1  # of fx / fy from 1
+FIT = 0.03  # distance from the middle and from square pixels at which another reading fits
 
 
 def view_deg(intrinsics: Intrinsics, size: Size) -> tuple[float, float]:
-    """Horizontal and vertical angle of view in degrees, for a principal point in the middle."""
+    """Horizontal and vertical angle of view in degrees, if the principal point is in the middle."""
     return tuple(math.degrees(2 * math.atan(size[i] / (2 * intrinsics[i]))) for i in (0, 1))
 
 
 def oddities(intrinsics: Intrinsics, size: Size) -> list[str]:
-    """List what is unusual about a camera for images of that (width, height); empty if nothing is."""
+    """Describe what is unusual about a camera for images of (width, height)."""
     found, views = [], view_deg(intrinsics, size)
     for angle, side in zip(views, ("wide", "high"), strict=True):
         if not USUAL_VIEW_DEG[0] <= angle <= USUAL_VIEW_DEG[1]:
@@ -36,13 +36,13 @@ def oddities(intrinsics: Intrinsics, size: Size) -> list[str]:
 
 
 def is_impossible(intrinsics: Intrinsics, size: Size) -> bool:
-    """Test whether no lens has such an angle of view: too narrow in one direction, or too wide."""
+    """Test whether no lens has such an angle of view."""
     views = view_deg(intrinsics, size)
     return not (min(views) >= NARROWEST_VIEW_DEG and max(views) <= USUAL_VIEW_DEG[1])
 
 
 def other_reading(numbers: Intrinsics, size: Size) -> str | None:
-    """Find another order, unit or image size in which the four numbers fit; return it with the intrinsics, or None."""
+    """Describe another order, unit or image size in which the numbers fit, with the intrinsics; None without."""
     (a, b, c, d), (w, h) = numbers, size
     scaled = w / (2 * (c + 0.5))
     readings = {
@@ -60,7 +60,7 @@ def other_reading(numbers: Intrinsics, size: Size) -> str | None:
 
 
 def _offsets(intrinsics: Intrinsics, size: Size) -> tuple[float, float]:
-    """Of the principal point from the middle, as shares of width and height."""
+    """Offset of the principal point from the middle, as shares of width and height."""
     return tuple((intrinsics[2 + i] + 0.5) / size[i] - 0.5 for i in (0, 1))
 
 

@@ -1,4 +1,4 @@
-"""Conventions in which programs write poses: what a pose is if it was written in another one than it was read in."""
+"""Conventions in which programs write poses: functions that convert a pose that was read in the wrong one."""
 
 from collections.abc import Callable, Mapping
 
@@ -8,13 +8,13 @@ from jaxtyping import Float
 from emgs_jax.ops.constants import FLIP
 
 EXPECTED = "poses camera -> world, quaternions x, y, z, w, axes of OpenCV (x right, y down, z ahead)"
-AHEAD_LEFT_UP = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # OpenCV's axes in a robot's
+AHEAD_LEFT_UP = np.array([[0, 0, 1, 0], [-1, 0, 0, 0], [0, -1, 0, 0], [0, 0, 0, 1.0]])  # OpenCV's axes in robots' axes
 AHEAD_RIGHT_DOWN = np.array([[0, 0, 1, 0], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 0, 1.0]])
 
 
 def _scalar_first(pose: Float[np.ndarray, "4 4"]) -> Float[np.ndarray, "4 4"]:
     """The pose whose quaternion w, x, y, z was read as x, y, z, w."""
-    from scipy.spatial.transform import Rotation  # slow to import, and only what does not fit needs it
+    from scipy.spatial.transform import Rotation  # slow to import, rarely needed
 
     changed = pose.copy()
     changed[:3, :3] = Rotation.from_quat(Rotation.from_matrix(pose[:3, :3]).as_quat()[[1, 2, 3, 0]]).as_matrix()

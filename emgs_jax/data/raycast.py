@@ -1,4 +1,4 @@
-"""Common part of the built-in scenes: frames with exact depth, labels and normals, cast from meshes at given poses."""
+"""Base of the built-in scenes: frames with exact depth, labels and normals, ray-cast from meshes at given poses."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -22,7 +22,7 @@ FOCAL_PER_WIDTH = 0.82  # 63 degrees across, as a Kinect
 
 @dataclass(frozen=True)
 class Scene:
-    """Objects in the world, z up, metres: class and mesh of each, and the look in the same row."""
+    """Objects in the world, z up, metres, and their looks in the same rows."""
 
     parts: list[Part]
     looks: Looks
@@ -30,25 +30,20 @@ class Scene:
 
 @dataclass(eq=False)
 class RayCast:
-    """A data set whose frames are cast when they are asked for: each depends on its pose only, not on those before.
-
-    A built-in scene is a subclass that names itself, its classes and its version, and says what to `_show`.
-    """
+    """A data set whose frames are cast on demand; a subclass has name, classes and version, and calls `_show`."""
 
     seed: int = 0  # of all that is drawn, 0 or more
-    num_frames: int | None = None  # images along the path, which stays the same: more frames are nearer to each other
-    # start, stop, stride: which of these images are in use
-    start: int = 0
+    num_frames: int | None = None  # images along the path, whatever their spacing
+    start: int = 0  # start, stop, stride: the images in use
     stop: int | None = None
     stride: int = 1
     size: Sequence[int] = (320, 240)  # (width, height)
-    intrinsics: Sequence[Number] | None = None  # fx, fy, cx, cy at `size`; None = .82 times the width and the centre
-    movers: int = 0  # how many things move, see `build_movers`
+    intrinsics: Sequence[Number] | None = None  # fx, fy, cx, cy at `size`; None: .82 times the width and the centre
+    movers: int = 0  # number of moving things, see `build_movers`
 
     name: ClassVar[str]
     classes: ClassVar[tuple[str, ...]]
-    # Goes up with every change of geometry, texture or path: recorded predictions then no longer fit.
-    version: ClassVar[int]
+    version: ClassVar[int]  # changes with geometry, texture or path, so that old recordings no longer fit
     has_ground_truth = True
 
     def __post_init__(self) -> None:
@@ -64,14 +59,7 @@ class RayCast:
     def _show(
         self, sequence: str, scene: Scene, poses: Float[np.ndarray, "n 4 4"], movers: Sequence[Mover] = ()
     ) -> None:
-        """Set what is cast.
-
-        Args:
-            sequence: name of the scene and of the path through it.
-            scene: what the rays meet; it must enclose all poses.
-            poses: T_world_camera of all images along the path.
-            movers: what moves in it, with a place for each image along the path.
-        """
+        """Set the scene, which must enclose all poses, and the poses and movers of all images along the path."""
         self._numbers = reading.select(len(poses), self.start, self.stop, self.stride, f"{self.name} {sequence}")
         self.sequence, self.parts, self._looks, self._poses = sequence, scene.parts, scene.looks, poses
         self.size = w, h = reading.check_size(self.size)
@@ -98,7 +86,7 @@ class RayCast:
         moving = np.full(objects.shape, STAYS, np.uint8) if self._movers else None
         for row, mover in enumerate(self._movers):
             here, T_mover_world = objects == first + row, np.linalg.inv(mover.poses[number])
-            own = points[here] @ T_mover_world[:3, :3].T + T_mover_world[:3, 3]  # its pattern goes with it
+            own = points[here] @ T_mover_world[:3, :3].T + T_mover_world[:3, 3]  # its texture moves with it
             image[here] = paint(own, normals[here], objects[here] - first, self._moving_looks)
             moving[here] = mover.states[number]
         name = f"{self.name} {self.sequence}, frame {number}"
@@ -114,12 +102,12 @@ class RayCast:
         return np.einsum("hwj,ji->hwi", normals, self._poses[self._numbers[index]][:3, :3].astype(np.float32))
 
     def _cast(self, index: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Depth (h, w), object (h, w), normal in the world (h, w, 3) and ray (origin, direction) (h, w, 6)."""
+        """Depth (h, w), object (h, w), world normal (h, w, 3), and ray (origin, direction) (h, w, 6)."""
         reading.check_index(index, len(self))
         (w, h), (fx, fy, cx, cy) = self.size, self.intrinsics
         pose = self._poses[self._numbers[index]]
         u, v = np.meshgrid((np.arange(w) - cx) / fx, (np.arange(h) - cy) / fy)
-        # In the camera a direction's z is 1, so the hit's parameter is the depth.
+        # A direction's z in the camera is 1, so the hit's parameter is the depth.
         directions = np.einsum("hwj,ij->hwi", np.stack([u, v, np.ones_like(u)], axis=-1), pose[:3, :3])
         rays = np.concatenate([np.broadcast_to(pose[:3, 3], directions.shape), directions], axis=-1).astype(np.float32)
         depth, objects, normals = _first_hits(self._scene, rays)
@@ -160,7 +148,7 @@ def _scene(meshes: Sequence[trimesh.Trimesh]) -> o3d.t.geometry.RaycastingScene:
 def _first_hits(
     scene: o3d.t.geometry.RaycastingScene, rays: Float32[np.ndarray, "h w 6"]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Depth (infinite where there is none), object and normal where each ray ends."""
+    """Depth (infinite without a hit), object and normal of each ray's first hit."""
     hit = scene.cast_rays(o3d.core.Tensor(rays))
     return hit["t_hit"].numpy(), hit["geometry_ids"].numpy().astype(np.int64), hit["primitive_normals"].numpy()
 
@@ -168,7 +156,7 @@ def _first_hits(
 def level_poses(
     positions: Float[np.ndarray, "n 3"], yaw: Float[np.ndarray, " n"], pitch: Float[np.ndarray, " n"]
 ) -> Float[np.ndarray, "n 4 4"]:
-    """T_world_camera without roll, OpenCV axes; yaw from the world's x about z, pitch up, in radians."""
+    """T_world_camera without roll, OpenCV axes, from yaw about z (0 along x) and pitch (up), radians."""
     forward = np.stack([np.cos(pitch) * np.cos(yaw), np.cos(pitch) * np.sin(yaw), np.sin(pitch)], axis=-1)
     right = np.stack([np.sin(yaw), -np.cos(yaw), np.zeros_like(yaw)], axis=-1)
     poses = np.tile(np.eye(4), (len(positions), 1, 1))

@@ -1,4 +1,4 @@
-"""Common parts of the data sets on disk: finding, choosing, reading, checking, resizing; failures name their file."""
+"""Shared by the data sets on disk: find, choose, read, check and resize; errors name their file."""
 
 import hashlib
 import math
@@ -19,19 +19,19 @@ Number = int | float  # a YAML value may be written 585 or 585.0
 Size = tuple[int, int]  # (width, height)
 Intrinsics = tuple[float, float, float, float]  # fx, fy, cx, cy; pixel centres at integers
 
-MAX_SIDE = 16384  # pixels; more is a slip of the hand, and would ask for gigabytes
-MAX_POSITION_M = 1000.0  # from the origin: steps of float32 are .06 mm there, and 6 cm at 1e6 m
-RIGID_TOLERANCE = 1e-2  # text files round; a flipped digit moves R^T R by more
-SAME_SURFACE = 0.05  # relative inverse-depth step to the next pixel up to which two depths are of one surface
-AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION  # not turned by EXIF: other programs solve for the pixels of the file
+MAX_SIDE = 16384  # pixels; more is a typing error
+MAX_POSITION_M = 1000.0  # from the origin, where steps of float32 are .06 mm; they are 6 cm at 1e6 m
+RIGID_TOLERANCE = 1e-2  # of R^T R, as text files round
+SAME_SURFACE = 0.05  # relative inverse-depth step between neighbouring pixels of one surface
+AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION  # not turned by EXIF, as other programs do not turn either
 HEIC = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"miaf", b"MiHE"}
 OWN_BITS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH  # BGR in 8 or 16 bits, or float
-EIGHT_BITS = b"\xff\xd8", b"BM", b"RIFF", b"GIF8"  # how files begin that have no more
+EIGHT_BITS = b"\xff\xd8", b"BM", b"RIFF", b"GIF8"  # signatures of formats without more bits
 REMEDY = "fetch the file again or set on_bad_frame=skip"
 
 
 def find_sequence(root: str | None, sequence: str | None, layout: str, source: str) -> Path:
-    """The folder (or file) root/sequence, or an error that names the path, the expected layout and where data is."""
+    """The folder (or file) root/sequence; errors name the path, the expected layout and the source of the data."""
     if root is None:
         raise ValueError(f"dataset.root is not set: give dataset.root=FOLDER with the layout {layout} ({source})")
     if sequence is None:
@@ -48,7 +48,7 @@ def find_sequence(root: str | None, sequence: str | None, layout: str, source: s
 
 
 def select(count: int, start: int, stop: int | None, stride: int, where: object) -> range:
-    """The images in use out of the `count` that are there, in order."""
+    """Choose images out of `count`; `where` names them in errors."""
     if count == 0:
         raise ValueError(f"{where} has no images")
     for name, value in (("start", start), ("stop", 0 if stop is None else stop), ("stride", stride)):
@@ -64,18 +64,18 @@ def select(count: int, start: int, stop: int | None, stride: int, where: object)
 
 
 def limit(start: int, stop: int | None) -> int | None:
-    """Return how many images must be counted before `select`; None = all, also where `start` and `stop` are invalid."""
+    """The number of images that must be counted before `select`; None: all, also if `start` or `stop` are invalid."""
     return stop if isinstance(start, int) and isinstance(stop, int) and 0 <= start < stop else None
 
 
 def check_index(index: int, count: int) -> None:
-    """IndexError outside of 0..count-1, so that a plain for loop over the data set ends."""
+    """Raise IndexError outside of 0..count-1, which ends a for loop over a data set."""
     if not 0 <= index < count:
         raise IndexError(f"frame {index} of a sequence with {count} frames")
 
 
 def check_size(size: Sequence[int]) -> Size:
-    """`size` as two positive integers."""
+    """Check that `size` is two positive integers."""
     values = tuple(size) if isinstance(size, Iterable) else (size,)
     if len(values) != 2 or not all(isinstance(value, int) and 1 <= value <= MAX_SIDE for value in values):
         raise ValueError(f"dataset.size must be [width, height] in pixels, up to {MAX_SIDE}, got {size}")
@@ -83,7 +83,7 @@ def check_size(size: Sequence[int]) -> Size:
 
 
 def check_depth_scale(depth_scale: Number, what: str = "dataset.depth_scale") -> float:
-    """`depth_scale` as a positive finite number; `what` says where it stands."""
+    """Check that a depth scale is positive and finite; `what` names it in errors."""
     if not (math.isfinite(depth_scale) and depth_scale > 0):
         raise ValueError(
             f"{what} must be raw units per metre, above 0, got {depth_scale}: correct it, or leave the key out for the "
@@ -95,7 +95,7 @@ def check_depth_scale(depth_scale: Number, what: str = "dataset.depth_scale") ->
 def check_intrinsics(
     intrinsics: str | Sequence[Number], raw_size: Size, what: str = "dataset.intrinsics", images: str = "images"
 ) -> Intrinsics:
-    """`intrinsics` as four numbers that fit an image of raw_size; `what` names them in errors, `images` the images."""
+    """Check that intrinsics are four numbers that fit images of `raw_size`; `what` and `images` name them in errors."""
     if isinstance(intrinsics, str):
         raise ValueError(f"{what} must be [fx, fy, cx, cy] in pixels for this data set, got {intrinsics!r}")
     values = tuple(float(v) for v in intrinsics)
@@ -110,23 +110,23 @@ def check_intrinsics(
 
 
 def resize_intrinsics(intrinsics: Intrinsics, raw_size: Size, size: Size) -> Intrinsics:
-    """Intrinsics after resizing; image borders stay borders, so c' = (c + .5) s - .5 with pixel centres at integers."""
+    """Intrinsics after resizing; image borders stay borders, so c' = (c + .5) s - .5."""
     fx, fy, cx, cy = intrinsics
     sx, sy = size[0] / raw_size[0], size[1] / raw_size[1]
     return fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5
 
 
 def resize_color(image: UInt8[np.ndarray, "_ _ 3"], size: Size) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Average of the pixels that fall into each new pixel."""
+    """Resize by averaging."""
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 
 def resize_nearest(values: np.ndarray, size: Size) -> np.ndarray:
-    """Depth (float) or label (integer) at each new pixel's centre; what lies on two sides of an edge is never mixed.
+    """Resize depths (float) or labels (integer) without mixing both sides of an edge.
 
-    The pixels around the centre vote by their bilinear weights, for labels that are equal and for depths of one
-    surface; of a tie wins the lower right. Where all depths are of one surface its inverse depth is interpolated, which
-    on a plane is exact: with even factors each single pixel is half a pixel off, and all to the same side.
+    The pixels around each new centre vote by bilinear weights for equal labels, or for depths of one surface; the lower
+    right wins a tie. If all depths are of one surface, inverse depth is interpolated, which is exact on a plane, where
+    the nearest pixel would be half a pixel off for even factors.
     """
     (top, bottom, v), (left, right, u) = (_around(*sides) for sides in zip(values.shape, size[::-1], strict=True))
     corners = np.stack([values[rows[:, None], columns] for rows in (bottom, top) for columns in (right, left)])
@@ -146,29 +146,29 @@ def resize_nearest(values: np.ndarray, size: Size) -> np.ndarray:
 
 
 def _around(count: int, wanted: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The pixels, of `count`, before and after each of `wanted` centres, and the weight of the second."""
+    """The pixels, of `count`, before and after each of `wanted` centres, and the second one's weight."""
     centres = np.clip((np.arange(wanted) + 0.5) * count / wanted - 0.5, 0, count - 1)
     before = np.floor(centres).astype(int)
     return before, np.minimum(before + 1, count - 1), centres - before
 
 
 def read_bytes(path: Path) -> bytes:
-    """A file's bytes; a missing file is a bad frame."""
+    """Read a file's bytes; BadFrameError if that fails."""
     try:
         return path.read_bytes()
     except FileNotFoundError as error:
         raise BadFrameError(f"{path} is missing: {REMEDY}") from error
-    except (OSError, ValueError) as error:  # ValueError: a zero byte in a name from a damaged list
+    except (OSError, ValueError) as error:  # ValueError: a zero byte in the name
         raise BadFrameError(f"{path} cannot be read ({error}): {REMEDY}") from error
 
 
 def read_text(path: Path) -> str:
-    """A file's text; bytes that are no text become a sign that no number parses."""
-    return read_bytes(path).decode("utf-8-sig", "replace")  # some editors put a mark before the first letter
+    """Read a file's text, without a byte order mark; invalid bytes are replaced."""
+    return read_bytes(path).decode("utf-8-sig", "replace")
 
 
 def layout_text(path: Path, layout: str) -> str:
-    """The text of a file of a data set's layout; FileNotFoundError, which says the layout, where it cannot be read."""
+    """Read a file's text; FileNotFoundError, which names the expected layout, if that fails."""
     try:
         return read_text(path)
     except BadFrameError as error:
@@ -176,11 +176,11 @@ def layout_text(path: Path, layout: str) -> str:
 
 
 def damage(data: bytes) -> str | None:
-    """Describe the damage of an encoded image; None if its format shows none. Decoders fill missing parts with grey."""
+    """Describe damage of an encoded image, whose missing parts decoders fill with grey; None if there is none."""
     if data.startswith(b"\x89PNG\r\n\x1a\n"):
         return _png_damage(data)
     if data.startswith(b"\xff\xd8"):
-        # Thumbnails before the scan have end markers of their own; inside the scan an 0xff is always escaped.
+        # Thumbnails before the scan have their own end markers; inside the scan an 0xff is escaped.
         scan = _jpeg_scan(data)
         return None if scan >= 0 and data.find(b"\xff\xd9", scan) >= 0 else "truncated: no end-of-image marker"
     if data.startswith(b"BM") and len(data) >= 6 and len(data) < struct.unpack("<I", data[2:6])[0]:
@@ -204,7 +204,7 @@ def _png_damage(data: bytes) -> str | None:
 
 
 def _jpeg_scan(data: bytes) -> int:
-    """Offset of the first scan, -1 if the header segments do not lead to one."""
+    """Offset of the first scan, or -1."""
     position = 2
     while position + 4 <= len(data) and data[position] == 0xFF:
         if data[position + 1] == 0xFF:  # fill byte
@@ -217,7 +217,7 @@ def _jpeg_scan(data: bytes) -> int:
 
 
 def decode(path: Path, flags: int) -> np.ndarray:
-    """The image in a file as cv2 gives it (BGR), or a BadFrameError."""
+    """Decode an image file by cv2 (BGR); BadFrameError if that fails."""
     data = read_bytes(path)
     reason = damage(data)
     image = None
@@ -234,7 +234,7 @@ def decode(path: Path, flags: int) -> np.ndarray:
 
 
 def orientation(path: Path) -> int:
-    """The EXIF orientation of an image, 1 (as it is stored) to 8; 1 where it has none."""
+    """The EXIF orientation of an image, from 1 (as stored, or none) to 8."""
     try:
         with Image.open(path) as image:
             found = image.getexif().get(ExifTags.Base.Orientation, 1)
@@ -244,7 +244,7 @@ def orientation(path: Path) -> int:
 
 
 def other_kind(data: bytes) -> str | None:
-    """What a file is by its content, of what OpenCV reads as no image; None where that is not known."""
+    """Name the kind of a file that OpenCV cannot decode, by its content; None if unknown."""
     if data[4:8] == b"ftyp":
         box = data[8 : max(int.from_bytes(data[:4], "big"), 12)]
         brands = {box[at : at + 4] for at in range(0, min(len(box), 128), 4) if at != 4}  # at 4 is a version
@@ -261,14 +261,14 @@ def other_kind(data: bytes) -> str | None:
 
 
 def read_color(path: Path, raw_size: Size | None = None, flags: int = 0) -> UInt8[np.ndarray, "_ _ 3"]:
-    """RGB image, turned as its EXIF says unless `flags` has AS_STORED; BadFrameError where its size is not raw_size."""
+    """Read an RGB image, turned by its EXIF unless `flags` has AS_STORED; BadFrameError unless it has `raw_size`."""
     image = decode(path, cv2.IMREAD_COLOR | flags)
     check_raw_size(image, raw_size, path)
     return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
 
 
 def read_depth(path: Path, depth_scale: float, raw_size: Size | None = None) -> Float32[np.ndarray, "_ _"]:
-    """Depth in metres from a 16-bit image, 0 where it has no value (raw 0 and 65535, the sensors' two marks)."""
+    """Read depth in metres from a 16-bit image, 0 = no value (raw 0 and 65535)."""
     raw = decode(path, cv2.IMREAD_UNCHANGED)
     if raw.dtype != np.uint16 or raw.ndim != 2:
         raise BadFrameError(f"{path} must be a 16-bit depth image with one channel, got {raw.dtype} {raw.shape}")
@@ -277,7 +277,7 @@ def read_depth(path: Path, depth_scale: float, raw_size: Size | None = None) -> 
 
 
 def check_raw_size(image: np.ndarray, raw_size: Size | None, path: object) -> None:
-    """BadFrameError where an image is not of the size that the calibration is for."""
+    """Raise BadFrameError unless an image has the calibration's size."""
     if raw_size is not None and image.shape[1::-1] != tuple(raw_size):
         (w, h), (width, height) = image.shape[1::-1], raw_size
         raise BadFrameError(
@@ -289,7 +289,7 @@ def check_raw_size(image: np.ndarray, raw_size: Size | None, path: object) -> No
 def first_size(
     images: Iterable[Any], where: object, flags: int = 0, read: Callable[[Any], np.ndarray] | None = None
 ) -> Size:
-    """(width, height) of the first image that can be read; `where` names them all; None = files as of `read_color`."""
+    """(width, height) of the first image that can be read, by default a file; `where` names them in errors."""
     reasons = []
     for image in images:
         try:
@@ -300,12 +300,12 @@ def first_size(
 
 
 def transparency_note(paths: Iterable[Path]) -> str | None:
-    """Words where an image is transparent in places, about the first such; files that cannot be read are left out."""
+    """Describe the first image that is transparent in places; None if there is none."""
     return next((note for path in paths if (note := _transparency(path))), None)
 
 
 def may_be_deep(path: Path) -> bool:
-    """Test by its first bytes whether an image may have more than 8 bits; only these are decoded to look."""
+    """Test by its first bytes whether an image may have more than 8 bits."""
     try:
         with open(path, "rb") as file:
             head = file.read(25)
@@ -320,7 +320,7 @@ def _transparency(path: Path) -> str | None:
             has_some = "A" in image.getbands() or "transparency" in image.info
             if not has_some or image.convert("RGBA").getchannel("A").getextrema()[0] >= 255:
                 return None
-    except (OSError, ValueError, SyntaxError):  # a damaged image, whose turn comes when it is read
+    except (OSError, ValueError, SyntaxError):  # damaged; reported when it is read
         return None
     return (
         f"{path.name} is transparent in places, and maybe others: what is there is mapped in the colour that the file "
@@ -329,11 +329,11 @@ def _transparency(path: Path) -> str | None:
 
 
 def as_pose(text: str, where: object, may_be_far: bool = False) -> Float[np.ndarray, "4 4"] | None:
-    """A rigid 4x4 transform from 16 numbers, row by row; None where they are inf or nan, which means lost tracking.
+    """Parse a rigid transform from 16 numbers, by rows; None if they are inf or nan (lost tracking).
 
     Raises:
         BadFrameError: they are no pose.
-        ValueError: it is farther away than positions can be held.
+        ValueError: it is too far away for float32.
     """
     try:
         pose = np.array([float(token) for token in text.split()], np.float64).reshape(4, 4)
@@ -352,14 +352,14 @@ def as_pose(text: str, where: object, may_be_far: bool = False) -> Float[np.ndar
             raise BadFrameError(f"{where} has a mirrored pose, as of one axis flipped: flip two of them, or none")
         raise BadFrameError(f"{where} has a pose that is no rigid motion: {REMEDY}")
     left, _, right = np.linalg.svd(pose[:3, :3])
-    pose[:3, :3] = left @ right  # the nearest rotation: the text is rounded
+    pose[:3, :3] = left @ right  # the nearest rotation, as the text is rounded
     if not may_be_far:
         check_position(pose[:3, 3], where)
     return pose
 
 
 def rigid(position: Sequence[float], quaternion: Sequence[float]) -> Float[np.ndarray, "4 4"]:
-    """The motion to a position, turned by a quaternion x, y, z, w; ValueError where one is not finite or this not 1."""
+    """The pose with a position and a quaternion x, y, z, w; ValueError unless finite and of length 1."""
     if not np.isfinite(position).all() or not abs(math.hypot(*quaternion) - 1) <= RIGID_TOLERANCE:
         raise ValueError("its quaternion has not length 1")
     from scipy.spatial.transform import Rotation  # slow to import, and no command's help needs it
@@ -370,7 +370,7 @@ def rigid(position: Sequence[float], quaternion: Sequence[float]) -> Float[np.nd
 
 
 def is_rigid(poses: Float[np.ndarray, "*b 4 4"]) -> bool:
-    """Test whether all poses are rigid motions, up to `RIGID_TOLERANCE`."""
+    """Test whether all poses are rigid, up to `RIGID_TOLERANCE`."""
     turns = poses[..., :3, :3]
     with np.errstate(over="ignore", invalid="ignore"):
         off = np.abs(turns @ turns.mT - np.eye(3))
@@ -379,7 +379,7 @@ def is_rigid(poses: Float[np.ndarray, "*b 4 4"]) -> bool:
 
 
 def check_position(position: Float[np.ndarray, " 3"], where: object) -> None:
-    """ValueError where a true position is so far away that float32, in which maps are, does not hold it."""
+    """Raise ValueError if a true position is too far away for float32."""
     if np.abs(position).max() > MAX_POSITION_M:
         shown = ", ".join(f"{value:g}" for value in position)
         raise ValueError(
@@ -389,7 +389,7 @@ def check_position(position: Float[np.ndarray, " 3"], where: object) -> None:
 
 
 def fingerprint(root: Path, files: Iterable[Path], options: dict[str, object]) -> str:
-    """Hex digest of the names and contents of the files and of the options; the same on every machine."""
+    """Hex digest of names and contents of files, and of options; independent of the machine."""
     digest = hashlib.sha256()
     files = set(files)
     names = {p.relative_to(root).as_posix() if p.is_relative_to(root) else p.name: p for p in files}
@@ -400,7 +400,7 @@ def fingerprint(root: Path, files: Iterable[Path], options: dict[str, object]) -
 
 
 def _content(path: Path) -> str:
-    """Digest of a file's bytes, empty where there is no file that can be read."""
+    """Digest of a file's bytes; empty if it cannot be read."""
     try:
         with open(path, "rb") as file:
             return hashlib.file_digest(file, hashlib.blake2b).hexdigest()

@@ -1,4 +1,4 @@
-"""Replica in the NICE-SLAM layout: cam_params.json, SCENE/traj.txt, SCENE/results/{frame%06d.jpg, depth%06d.png}."""
+"""Replica in NICE-SLAM's layout: cam_params.json, SCENE/traj.txt, SCENE/results/{frame%06d.jpg, depth%06d.png}."""
 
 import json
 import re
@@ -27,8 +27,8 @@ class Replica(Straightened):
 
     stride: int = 10
     size: Sequence[int] = (320, 180)
-    intrinsics: Given | None = None  # of the images on disk, as `Images` takes them; None = those of cam_params.json
-    depth_scale: Number | None = None  # raw units per metre; None = that of cam_params.json
+    intrinsics: Given | None = None  # of the images on disk, as for `Images`; None: those of cam_params.json
+    depth_scale: Number | None = None  # raw units per metre; None: that of cam_params.json
 
     name, layout, source = "replica", LAYOUT, SOURCE
     has_ground_truth = True
@@ -39,7 +39,7 @@ class Replica(Straightened):
         chosen = self._select(len(images), f"{self._folder / 'results'} (layout {LAYOUT})")
         self._images = [images[i] for i in chosen]
         self._times = [number_of(path) for path in self._images]
-        self._depths = [depth_path(path) for path in self._images]
+        self._depths = [path.with_name(f"depth{path.stem[len('frame') :]}.png") for path in self._images]
         self._files = (self._folder / "traj.txt",)
         self._poses = read_rows(self._files[0], self._images)
         path = Path(str(self.root)).expanduser() / "cam_params.json"
@@ -59,7 +59,7 @@ class Replica(Straightened):
 
 
 def find_images(folder: Path) -> list[Path]:
-    """frame%06d.jpg (or .png) in the order of their numbers."""
+    """Find frame%06d.jpg (or .png), in the order of their numbers."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} does not exist; expected the layout {LAYOUT} ({SOURCE})")
     found = [p for p in folder.iterdir() if re.fullmatch(r"frame[0-9]+\.(jpe?g|png)", p.name, re.IGNORECASE)]
@@ -71,13 +71,8 @@ def number_of(path: Path) -> int:
     return int(path.stem[len("frame") :])
 
 
-def depth_path(path: Path) -> Path:
-    """depth000012.png for frame000012.jpg."""
-    return path.with_name(f"depth{path.stem[len('frame') :]}.png")
-
-
 def read_rows(path: Path, images: list[Path]) -> list[str]:
-    """The row of traj.txt for every image, still as text: image frame000012 belongs to row 12, from 0."""
+    """Read the row of traj.txt, as text, of every image: frame000012 belongs to row 12, from 0."""
     text = reading.layout_text(path, LAYOUT).rstrip()
     rows, last = [row for row in text.splitlines() if not row.lstrip().startswith("#")], max(map(number_of, images))
     if not all(map(str.strip, rows)) and last < sum(map(bool, map(str.strip, rows))):
@@ -91,7 +86,7 @@ def read_rows(path: Path, images: list[Path]) -> list[str]:
 
 
 def read_calibration(path: Path) -> tuple[Size, Intrinsics, float]:
-    """Image size, intrinsics and depth scale from cam_params.json."""
+    """Read image size, intrinsics and depth scale from cam_params.json."""
     try:
         camera = json.loads(reading.layout_text(path, LAYOUT))["camera"]
         size = int(camera["w"]), int(camera["h"])

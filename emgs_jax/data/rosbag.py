@@ -1,4 +1,4 @@
-"""Images of a bag of ROS 1 or 2, read without ROS by the library rosbags; no ground truth."""
+"""Images of a bag of ROS 1 or 2, read without ROS by the package rosbags; no ground truth."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -20,22 +20,22 @@ from emgs_jax.data.tones import ALL_16_BITS, find_tones
 
 LAYOUT = "root[/sequence] = a .bag of ROS 1, or the folder of a ROS 2 bag with metadata.yaml"
 RAW, COMPRESSED, INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
-# Channels of an encoding, and OpenCV's conversion to RGB. 8UC… is what OpenCV's programs publish where nobody says the
-# encoding: its own order of colours.
+# Channels of an encoding, and OpenCV's conversion to RGB. Programs publish 8UC… when they name no encoding: then it is
+# OpenCV's order of colours.
 ENCODINGS = {"rgb8": (3, None), "bgr8": (3, cv2.COLOR_BGR2RGB), "8UC3": (3, cv2.COLOR_BGR2RGB)}
 ENCODINGS |= {"rgba8": (4, cv2.COLOR_RGBA2RGB), "bgra8": (4, cv2.COLOR_BGRA2RGB), "8UC4": (4, cv2.COLOR_BGRA2RGB)}
 ENCODINGS |= dict.fromkeys(("mono8", "mono16", "8UC1"), (1, cv2.COLOR_GRAY2RGB))
-DEPTHS = re.compile(r"(16|32|64)[USF]C[1-4]$")  # also where they are compressed, as if they were pictures
-RECTIFIED = re.compile(r"(^|[/_])rect([/_]|$)")  # a topic, as image_proc and others name it
+DEPTHS = re.compile(r"(16|32|64)[USF]C[1-4]$")  # also of compressed depths
+RECTIFIED = re.compile(r"(^|[/_])rect([/_]|$)")  # a topic of image_proc and others
 
 
 @dataclass(eq=False)
 class RosBag(Straightened):
     """The images of one topic of the bag root or root/sequence, in the order in which they were taken."""
 
-    topic: str | None = None  # of sensor_msgs/Image or CompressedImage; None = the only one
-    info_topic: str | None = None  # of sensor_msgs/CameraInfo; None = camera_info beside the topic, or the only one
-    intrinsics: Given | None = None  # as `Images` takes them; None = those of the first CameraInfo
+    topic: str | None = None  # of sensor_msgs/Image or CompressedImage; None: the only one
+    info_topic: str | None = None  # of sensor_msgs/CameraInfo; None: camera_info beside the topic, or the only one
+    intrinsics: Given | None = None  # as for `Images`; None: those of the first CameraInfo
 
     name, layout, source = "rosbag", LAYOUT, "ros2 bag record"
 
@@ -46,7 +46,7 @@ class RosBag(Straightened):
             self._topic = _topic_of(bag, (RAW, COMPRESSED), self.topic, self._path, "topic")
             received, stamps = _times(bag, self._topic)
             info = None if self.intrinsics is not None else _camera_info(bag, self._topic, self.info_topic, self._path)
-        first: dict[int, int] = {}  # several may have one time
+        first: dict[int, int] = {}  # row of each time, which several messages may share
         places = [(time, row - first.setdefault(time, row)) for row, time in enumerate(received)]
         taken, note = when_taken(received, stamps)
         order = sorted(range(len(taken)), key=lambda row: taken[row])
@@ -97,23 +97,23 @@ class RosBag(Straightened):
 
 
 def _times(bag: Any, topic: str) -> tuple[list[int], list[int]]:
-    """When each message of a topic was received and its header's stamp, in nanoseconds; 0 = it has none."""
+    """Nanoseconds at which each message of a topic was received, and its header's stamp; 0 = none."""
     received, stamps = [], []
     for connection, time, raw in bag.messages(connections=_connections(bag, topic)):
         received.append(time)
         try:
             stamp = bag.deserialize(raw, connection.msgtype).header.stamp
             stamps.append(stamp.sec * 10**9 + stamp.nanosec)
-        except Exception:  # of a damaged message, which is a bad frame when it is read
+        except Exception:  # a damaged message, which is a bad frame when it is read
             stamps.append(0)
     return received, stamps
 
 
 def when_taken(received: Sequence[int], stamps: Sequence[int]) -> tuple[list[int], str | None]:
-    """Nanoseconds at which images were taken: their headers' stamps, as messages arrive late and overtake each other.
+    """Nanoseconds at which images were taken, by their headers' stamps, as messages overtake each other.
 
-    Where a driver stamps nothing, or all alike, it is when they were received, and a note says so. One message without
-    a stamp was taken as long before it came as the others (median).
+    If no message has a stamp, or all have the same, the times of reception are taken, with a note. A single message
+    without one gets the others' median delay.
     """
     known = [row for row, stamp in enumerate(stamps) if stamp > 0]
     if not known or (len(known) > 1 and len({stamps[row] for row in known}) == 1):
@@ -123,11 +123,7 @@ def when_taken(received: Sequence[int], stamps: Sequence[int]) -> tuple[list[int
 
 
 def to_rgb(message: Any, is_compressed: bool, label: str) -> np.ndarray:
-    """The picture of a message, RGB (h, w, 3) in its own bits, 8 or 16.
-
-    Raises:
-        BadFrameError: it is damaged or of an encoding that is not read.
-    """
+    """The picture of a message, RGB (h, w, 3), 8 or 16 bits; BadFrameError if it is damaged or its encoding unknown."""
     encoding = str(message.format).partition(";")[0].strip() if is_compressed else str(message.encoding)
     is_depth = DEPTHS.match(encoding) is not None or (is_compressed and "compressedDepth" in str(message.format))
     if is_depth or (not is_compressed and encoding not in ENCODINGS):
@@ -156,7 +152,7 @@ def to_rgb(message: Any, is_compressed: bool, label: str) -> np.ndarray:
 
 @contextmanager
 def _opened(path: Path) -> Iterator[Any]:
-    """The bag's reader; what it cannot read is a ValueError that names the bag."""
+    """Open a bag; errors become a ValueError that names it."""
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
@@ -165,7 +161,7 @@ def _opened(path: Path) -> Iterator[Any]:
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
             yield bag
-    except Exception as error:  # a damaged bag makes the library, and SQLite below it, raise anything
+    except Exception as error:  # the library and SQLite raise many types for a damaged bag
         if isinstance(error, ValueError) and str(path) in str(error):
             raise  # ours
         what = f"{type(error).__name__}: {error}"[:200]
@@ -177,7 +173,7 @@ def _connections(bag: Any, topic: str) -> list[Any]:
 
 
 def _topic_of(bag: Any, kinds: Sequence[str], topic: str | None, path: Path, key: str) -> str:
-    """The topic that is asked for, or the only one of these kinds."""
+    """The given topic, or the only one of these kinds."""
     there = sorted({connection.topic for connection in bag.connections if connection.msgtype in kinds})
     if topic in there:
         return topic
@@ -186,10 +182,8 @@ def _topic_of(bag: Any, kinds: Sequence[str], topic: str | None, path: Path, key
     kind = kinds[0].rsplit("/", 1)[1]
     if not there:
         raise ValueError(f"{path} has no topic of sensor_msgs/{kind}")
-    what = (
-        f"{path} has no topic {topic} of sensor_msgs/{kind}" if topic else f"{path} has several of sensor_msgs/{kind}"
-    )
-    raise ValueError(f"{what}: give dataset.{key}= one of {', '.join(there)}")
+    what = f"no topic {topic}" if topic else "several"
+    raise ValueError(f"{path} has {what} of sensor_msgs/{kind}: give dataset.{key}= one of {', '.join(there)}")
 
 
 def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Calibration:
@@ -204,7 +198,7 @@ def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Ca
         message = bag.deserialize(raw, connection.msgtype)
         K, bent, P = (getattr(message, name if hasattr(message, name) else name.upper()) for name in "kdp")  # ROS 1: K
         size, bent = (int(message.width), int(message.height)), [float(v) for v in bent]
-        if RECTIFIED.search(topic):  # K and D are those of the raw image, P is what it was made to
+        if RECTIFIED.search(topic):  # K and D are of the raw image, P of the rectified one
             if not P[0] > 0 or not P[5] > 0:
                 raise ValueError(f"{path}: camera_info has no P for the rectified {topic}: give dataset.intrinsics")
             return Calibration((float(P[0]), float(P[5]), float(P[2]), float(P[6])), (), size)

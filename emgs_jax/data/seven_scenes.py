@@ -19,7 +19,7 @@ from emgs_jax.data.straightened import Straightened
 LAYOUT = "root/SCENE/seq-XX/frame-000000.{color.png or color.jpg, depth.png, pose.txt}"
 SOURCE = "7-Scenes, project page of Microsoft Research; unpack the inner seq-XX.zip as well"
 RAW_SIZE = (640, 480)
-# The release has no calibration: the depth camera is KinectFusion's, the colour camera and the transform are kapture's.
+# The release has no calibration: the depth camera's is KinectFusion's, the colour camera's and the transform kapture's.
 DEPTH_INTRINSICS = (585.0, 585.0, 320.0, 240.0)
 COLOR_INTRINSICS = (525.0, 525.0, 320.0, 240.0)
 T_COLOR_DEPTH = np.array(
@@ -30,8 +30,8 @@ T_COLOR_DEPTH = np.array(
         [0.0, 0.0, 0.0, 1.0],
     ]
 )
-FOOTPRINT_MARGIN = 1.2  # slanted surfaces spread: a little overlap leaves no holes between neighbouring pixels
-NEAR = 0.05  # metres; nothing the sensor measures is nearer
+FOOTPRINT_MARGIN = 1.2  # overlap of neighbouring pixels, so that slanted surfaces have no holes
+NEAR = 0.05  # metres; the sensor measures nothing nearer
 
 
 @dataclass(eq=False)
@@ -39,11 +39,9 @@ class SevenScenes(Straightened):
     """One sequence of 7-Scenes, "SCENE/seq-XX"."""
 
     stride: int = 10
-    # of the 640x480 colour images, as `Images` takes them; None = 525 when registered, else 585
-    intrinsics: Given | None = None
+    intrinsics: Given | None = None  # of the 640x480 colour images, as for `Images`; None: 525 if registered, else 585
     depth_scale: Number = 1000.0  # raw units per metre
-    # warp depth into the colour camera and give its pose; else depth and pose are the depth camera's
-    register_depth: bool = True
+    register_depth: bool = True  # warp depth into the colour camera and give its pose; else the depth camera's
     poses: str | None = None  # file with the true poses, in place of the release's, see `read_poses`
 
     name, layout, source = "seven_scenes", LAYOUT, SOURCE
@@ -70,9 +68,8 @@ class SevenScenes(Straightened):
     def _depth(self, index: int) -> Float32[np.ndarray, "h w"]:
         if not self.register_depth:
             return super()._depth(index)
-        return register(
-            reading.read_depth(self._depths[index], self._depth_scale, RAW_SIZE), self.intrinsics, self.size
-        )
+        raw = reading.read_depth(self._depths[index], self._depth_scale, RAW_SIZE)
+        return register(raw, self.intrinsics, self.size)
 
     def pose(self, index: int) -> Float[np.ndarray, "4 4"] | None:
         if self._poses is not None:
@@ -94,16 +91,17 @@ class SevenScenes(Straightened):
 
 
 def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"]]:
-    """T_world_camera of the colour camera by frame number, from a list of pseudo ground truth.
+    """Read T_world_camera of the colour camera by frame number, from a list of pseudo ground truth.
 
-    The release's poses are KinectFusion's, whose depth camera is not calibrated: in redkitchen they turn 8 % more, and
-    move 5 % less, than the colour images say, so no reconstruction from these can have the shape of the true one. Poses
-    from structure from motion are published for all scenes (Brachmann, Humenberger, Rother and Sattler, "On the limits
-    of pseudo ground truth in visual camera re-localisation", ICCV 2021), in lines "seq-XX/frame-000000.color.png qw qx
-    qy qz tx ty tz focal", world -> colour camera; # begins a comment.
+    The release's poses are of KinectFusion with an uncalibrated depth camera: in redkitchen they turn 8 % more and move
+    5 % less than the colour images, so a reconstruction from these cannot have their shape. Poses from structure from
+    motion are published for all scenes (Brachmann, Humenberger, Rother and Sattler, "On the limits of pseudo ground
+    truth in visual camera re-localisation", ICCV 2021), in lines "seq-XX/frame-000000.color.png qw qx qy qz tx ty tz
+    focal", world -> colour camera; # begins a comment. Lines of other sequences are ignored.
 
-    Lines of other sequences than `sequence` are left out; BadFrameError where a line is none, ValueError where none is
-    of the sequence.
+    Raises:
+        BadFrameError: a line of the sequence is damaged.
+        ValueError: there is none of the sequence.
     """
     found = {}
     for row, line in enumerate(reading.read_text(path).splitlines(), start=1):
@@ -112,7 +110,7 @@ def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"
             continue
         try:
             w, x, y, z, *translation = (float(number) for number in numbers[:7])
-            if not np.isfinite([w, x, y, z, *translation]).all():  # the camera was lost there
+            if not np.isfinite([w, x, y, z, *translation]).all():  # lost tracking
                 continue
             T_world_camera = np.linalg.inv(reading.rigid(translation, (x, y, z, w)))
         except ValueError as error:
@@ -126,7 +124,7 @@ def read_poses(path: Path, sequence: str) -> dict[float, Float[np.ndarray, "4 4"
 
 
 def find_images(folder: Path) -> list[Path]:
-    """Colour images in the order of their numbers; where a frame is there as png and as jpg, the png."""
+    """Find colour images in the order of their numbers; png is preferred to jpg."""
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} is no folder; expected the layout {LAYOUT} ({SOURCE})")
     found: dict[float, Path] = {}
@@ -147,13 +145,13 @@ def sibling(path: Path, ending: str) -> Path:
 
 
 def register(depth: Float32[np.ndarray, "_ _"], intrinsics: Intrinsics, size: Size) -> Float32[np.ndarray, "_ _"]:
-    """Depth of the colour camera at `size` from the depth camera's 640x480 image; metres, 0 where nothing falls.
+    """Warp the depth camera's 640x480 image into the colour camera at `size`; metres, 0 = none.
 
-    Every source pixel is a square that covers the target pixels whose centres lie in it; the nearest surface wins, and
-    of that the mean inverse depth: the nearest square alone is before a slanted surface.
+    Every source pixel is a square that covers the target pixels whose centres lie in it. The nearest surface wins, with
+    its mean inverse depth, as the nearest square alone lies before a slanted surface.
     """
     points = backproject(depth, DEPTH_INTRINSICS)[depth > NEAR]
-    # einsum, as a threaded matmul of this shape waits for its threads when the machine is busy
+    # einsum, as a threaded matmul waits for its threads on a busy machine
     points = np.einsum("pj,ij->pi", points, T_COLOR_DEPTH[:3, :3]) + T_COLOR_DEPTH[:3, 3]
     points = points[points[:, 2] > NEAR]  # in the colour camera's axes
     (fx, fy, cx, cy), (w, h) = intrinsics, size

@@ -1,4 +1,4 @@
-"""Arrays that do not fit into memory together: written to a temporary file as they come, read back one by one."""
+"""A sequence of arrays in a temporary file, for data that does not fit into memory."""
 
 import tempfile
 import threading
@@ -7,15 +7,14 @@ import numpy as np
 
 
 class Spool:
-    """A sequence of arrays that grows at its end, for any thread; the file has no name and goes with the object.
+    """A thread-safe sequence of arrays in a file that is deleted with the object.
 
-    The file has bytes alone: of `numpy.save` it would have headers, and two threads that parse some at once are a
-    SystemError before Python 3.11.8.
+    The file holds plain bytes: before Python 3.11.8 two threads that parse headers of `numpy.save` raise SystemError.
     """
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 (open as long as this object)
-        self._places: list[tuple[int, tuple[int, ...], np.dtype]] = []  # of each array: begin, shape and type
+        self._places: list[tuple[int, tuple[int, ...], np.dtype]] = []  # offset, shape and type of each array
         self._lock, self.num_bytes = threading.Lock(), 0
 
     def append(self, array: np.ndarray) -> int:

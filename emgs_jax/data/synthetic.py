@@ -1,4 +1,4 @@
-"""A furnished room, ray-cast: images with exact depth, poses, labels and normals, from nothing but a seed."""
+"""A ray-cast, furnished room: images with exact depth, poses, labels and normals, from a seed."""
 
 from dataclasses import dataclass
 
@@ -12,12 +12,12 @@ from emgs_jax.data.movers import Doorway, Lane
 from emgs_jax.data.raycast import RayCast, Scene, level_poses
 
 MARGIN = np.array([1.25, 1.05])  # from the walls to the camera's ellipse
-ARC = np.radians(140.0)  # of the round that the camera goes
+ARC = np.radians(140.0)  # of the camera's path
 
 
 @dataclass(eq=False)
 class Synthetic(RayCast):
-    """The camera goes round the middle of a room and looks across it: about 6.5 cm and 3.6 degrees a frame of 40."""
+    """The camera circles the middle of a room and looks across it: about 6.5 cm and 3.6 degrees a frame of 40."""
 
     num_frames: int = 40
 
@@ -33,7 +33,7 @@ class Synthetic(RayCast):
 
 
 def build_room(rng: np.random.Generator) -> tuple[list[Part], Float[np.ndarray, " 3"]]:
-    """Objects of a random room as (class, mesh) and its size x, y, z in metres; the origin is the floor's centre."""
+    """Build the objects of a random room, and its size x, y, z in metres; the origin is the floor's centre."""
     size = np.array([5.0, 4.0, 2.6]) * rng.uniform(0.95, 1.05, 3)
     parts = _shell(size) + furniture.table_with_chairs(rng)
     walls = rng.permutation(4).tolist()
@@ -52,9 +52,8 @@ def build_room(rng: np.random.Generator) -> tuple[list[Part], Float[np.ndarray, 
 
 def _shell(size: Float[np.ndarray, " 3"]) -> list[Part]:
     (x, y, z), t = size, 0.1
-    parts = furniture.join("floor", furniture.box((x + t, y + t, t), (0, 0, -t))) + furniture.join(
-        "ceiling", furniture.box((x + t, y + t, t), (0, 0, z))
-    )
+    parts = furniture.join("floor", furniture.box((x + t, y + t, t), (0, 0, -t)))
+    parts += furniture.join("ceiling", furniture.box((x + t, y + t, t), (0, 0, z)))
     for s in (-1, 1):
         parts += furniture.join("wall", furniture.box((t, y + t, z), (s * (x + t) / 2, 0, 0)))
         parts += furniture.join("wall", furniture.box((x + t, t, z), (0, s * (y + t) / 2, 0)))
@@ -62,7 +61,7 @@ def _shell(size: Float[np.ndarray, " 3"]) -> list[Part]:
 
 
 def lane_around(room_size: Float[np.ndarray, " 3"], camera: Float[np.ndarray, "n 2"]) -> Lane:
-    """The camera's ellipse all the way round; the camera looks across it. A leaf swings from the wall that it faces."""
+    """The camera's whole ellipse, across which it looks; a door leaf swings from the wall that it faces."""
     radii = room_size[:2] / 2 - MARGIN
     angle = np.unwrap(np.arctan2(*(camera / radii).T[::-1]))
     sense = 1.0 if angle[-1] >= angle[0] else -1.0
@@ -81,7 +80,7 @@ def lane_around(room_size: Float[np.ndarray, " 3"], camera: Float[np.ndarray, "n
 def camera_path(
     num_frames: int, room_size: Float[np.ndarray, " 3"], rng: np.random.Generator
 ) -> Float[np.ndarray, "n 4 4"]:
-    """T_world_camera along an arc above the furniture, looking inward and a little down, without roll."""
+    """T_world_camera along an arc above the furniture, looking inward and slightly down, without roll."""
     begin, sense, phase = rng.uniform(0, 2 * np.pi), rng.choice([-1.0, 1.0]), rng.uniform(0, 2 * np.pi)
     round_ = np.linspace(0, ARC, num_frames)
     angle = begin + sense * round_

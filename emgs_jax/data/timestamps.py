@@ -1,4 +1,4 @@
-"""Times as programs write them (seconds, or clocks that count smaller units), and what is nearest to them in time."""
+"""Times as programs write them, in seconds or smaller units, and nearest neighbours in time."""
 
 import math
 from pathlib import Path
@@ -6,19 +6,18 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-UNITS = {"seconds": 1, "milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}  # how many are a second
+UNITS = {"seconds": 1, "milliseconds": 10**3, "microseconds": 10**6, "nanoseconds": 10**9}  # number in a second
 EPOCH = 1e9, 4.2e9  # seconds since 1970, from 2001 to 2103
-MIN_STEP_US, MIN_STEP_NS = 1e4, 1e6  # between two images; as seconds that would be hours
-MIN_CLOCK = 1e7  # no count of frames is so high; it is of a clock
+MIN_STEP_US, MIN_STEP_NS = 1e4, 1e6  # between two images; as seconds these would be hours
+MIN_CLOCK = 1e7  # of a clock; frame numbers are smaller
 MAX_UPTIME_S, TYPICAL_STEP_S = 4e7, 1 / 30  # since a boot, and between two images
 
 
 def unit_of(times: np.ndarray) -> str:
-    """The unit in which numbers (n,), ascending, are times: one of UNITS; "seconds" too where they may be no times.
+    """Guess the unit, one of UNITS, of ascending times (n,); "seconds" if they may be no times.
 
-    What counts from 1970 says its unit by its size. What counts from elsewhere (a boot) does by the step from one image
-    to the next: it is the unit in which that is most like the step of a video. Below `MIN_CLOCK` that is said of
-    microseconds and nanoseconds only, as steps of 33 may be those of frame numbers.
+    Times since 1970 tell it by their size, other clocks by the step between images, which should be like a video's.
+    Below `MIN_CLOCK` steps of 33 may be those of frame numbers, so only microseconds and nanoseconds are recognised.
     """
     for unit, per_second in UNITS.items():
         if len(times) and EPOCH[0] <= np.min(times) / per_second and np.max(times) / per_second <= EPOCH[1]:
@@ -32,19 +31,19 @@ def unit_of(times: np.ndarray) -> str:
 
 
 def in_seconds(times: np.ndarray) -> np.ndarray:
-    """Numbers (n,), ascending, as seconds; float64."""
+    """Ascending times (n,) as seconds, float64, by `unit_of`."""
     return np.asarray(times, np.float64) / UNITS[unit_of(times)]
 
 
 def resolution(*times: np.ndarray) -> float:
-    """Seconds by which float64 may miss times so large: no two of them are told apart by less."""
+    """The rounding error of float64 for times of this size, in seconds."""
     return float(np.spacing(max((np.abs(values).max(initial=0.0) for values in times), default=0.0)))
 
 
 def matched_rows(
     times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, " m"], tolerance: float, of: tuple[str, Path]
 ) -> list[int]:
-    """`nearest_rows`, which some image must have; `of` says what of and where it is listed."""
+    """`nearest_rows`; ValueError if no image has one. `of` says of what, and names the file."""
     rows = nearest_rows(times, candidates, tolerance)
     if max(rows) < 0:
         what, path = of
@@ -61,10 +60,7 @@ def _span(times: Float[np.ndarray, " n"]) -> str:
 
 
 def nearest_rows(times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, " m"], tolerance: float) -> list[int]:
-    """Row of `candidates` (ascending) nearest to each time, -1 where none is within the tolerance in seconds.
-
-    Times that differ by the tolerance are within it, however float64 rounds them: seconds since 1970 by 2e-7.
-    """
+    """Row of the ascending `candidates` nearest to each time, -1 if none is within the tolerance (s) and rounding."""
     if len(candidates) == 0:
         return [-1] * len(times)
     after = np.clip(np.searchsorted(candidates, times), 1, max(len(candidates) - 1, 1))
@@ -76,7 +72,7 @@ def nearest_rows(times: Float[np.ndarray, " n"], candidates: Float[np.ndarray, "
 
 
 def check_tolerance(seconds: float) -> float:
-    """`dataset.max_time_difference` as finite seconds, 0 or more."""
+    """Check that `dataset.max_time_difference` is finite and not negative."""
     if not (np.isfinite(seconds) and seconds >= 0):
         raise ValueError(f"dataset.max_time_difference must be seconds, 0 or more, got {seconds}")
     return float(seconds)

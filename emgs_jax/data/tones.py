@@ -1,4 +1,4 @@
-"""Images of more than 8 bits, shown in 8: sensors fill 10, 12 or 14 of 16, and their images would be almost black."""
+"""Map images of more than 8 bits to 8: sensors fill 10, 12 or 14 of 16 bits, which would be almost black."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -10,10 +10,10 @@ from jaxtyping import UInt8
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
 
-MAX_LOOKED_AT = 16  # images, evenly spread: all become 8 bits alike, or the brightness would flicker
-OUTLIERS_PERCENT = 0.1  # of the pixels at either end: dead and hot ones
-MIN_SPAN = 0.5  # of the 16 bits; what spans more is shown as it is
-MIN_FOOT = 0.25  # of the highest value: below that black stays black
+MAX_LOOKED_AT = 16  # images, evenly spread; one range for all, or the brightness would flicker
+OUTLIERS_PERCENT = 0.1  # dead and hot pixels at either end
+MIN_SPAN = 0.5  # of the 16 bits; a larger range is not stretched
+MIN_FOOT = 0.25  # of the highest value; a lower minimum stays 0
 
 
 @dataclass(frozen=True)
@@ -39,14 +39,9 @@ ALL_16_BITS = Tones(0.0, 65535.0)
 
 
 def find_tones(read: Callable[[int], np.ndarray], count: int) -> Tones | None:
-    """Find the range of grey values that is shown in 8 bits, from a sample of `count` images.
+    """Find the range of values to show in 8 bits, from a sample of `count` images; images of 8 bits do not count.
 
-    Args:
-        read: image 0..count-1 in its own bits; raises BadFrameError.
-
-    Returns:
-        None for images of 8 bits, for 16 bits of which more than MIN_SPAN is used, and where no image can be read.
-        Among others those of 8 bits do not count: they stay as they are.
+    None if all have 8 bits, if more than MIN_SPAN of 16 bits is used, or if none can be read (BadFrameError).
     """
     ends, dtype = [], None
     for row in dict.fromkeys(np.linspace(0, count - 1, min(count, MAX_LOOKED_AT)).astype(int).tolist()):
@@ -68,7 +63,7 @@ def find_tones(read: Callable[[int], np.ndarray], count: int) -> Tones | None:
 
 
 def tones_of(files: Sequence[Path]) -> Tones | None:
-    """Those of image files, of which some may have more bits than others."""
+    """The tones of image files, which may have different bits."""
     deep = [path for path in files if reading.may_be_deep(path)]
     return find_tones(lambda row: reading.decode(deep[row], reading.OWN_BITS), len(deep))
 
@@ -76,7 +71,7 @@ def tones_of(files: Sequence[Path]) -> Tones | None:
 def read_shown(
     path: Path, raw_size: reading.Size | None, tones: Tones | None, flags: int = 0
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """`reading.read_color` of an image that may have more than 8 bits."""
+    """As `reading.read_color`, of an image that may have more than 8 bits."""
     if tones is None:
         return reading.read_color(path, raw_size, flags)
     image = reading.decode(path, reading.OWN_BITS | flags)

@@ -1,4 +1,4 @@
-"""TUM RGB-D and every folder of its layout: rgb.txt, depth.txt, groundtruth.txt, associated by timestamp."""
+"""TUM RGB-D and other data in its layout: rgb.txt, depth.txt, groundtruth.txt, associated by timestamp."""
 
 import math
 import re
@@ -22,7 +22,7 @@ from emgs_jax.data.tones import tones_of
 
 LAYOUT = "root/SEQUENCE/{rgb.txt, depth.txt, groundtruth.txt, rgb/, depth/}"
 RAW_SIZE = (640, 480)
-Calibrations = Mapping[str, tuple[Intrinsics, tuple[float, ...] | None]]  # by what stands in a sequence's name
+Calibrations = Mapping[str, tuple[Intrinsics, tuple[float, ...] | None]]  # by a part of the sequence's name
 REMEDY = "correct the line or take it out (its image then has no true pose), or set on_bad_frame=skip"
 # Calibration by the benchmark (digits of ORB-SLAM2); fr3 comes undistorted. Distortion is k1, k2, p1, p2, k3.
 CALIBRATIONS: Calibrations = {
@@ -40,15 +40,14 @@ CALIBRATIONS: Calibrations = {
 
 @dataclass(eq=False)
 class TumLayout(Straightened):
-    """One sequence in the TUM layout, images of rgb.txt in order of time.
+    """One sequence in TUM's layout, images in order of time; ground truth needs depth.txt and groundtruth.txt.
 
-    Without depth.txt or groundtruth.txt there is no ground truth. A colour image without depth near in time stays in
-    use with depth 0 everywhere; one without a pose, or with one of inf or nan, has none. A list that no image has
-    anything of is an error.
+    A colour image without depth near in time has depth 0 everywhere; without a pose near, or with inf or nan, it has
+    none. It is an error if no image has a depth, or none a pose.
     """
 
     stride: int = 10
-    intrinsics: Given | None = None  # of the images on disk, as `Images` takes them; None = the benchmark's calibration
+    intrinsics: Given | None = None  # of the images on disk, as for `Images`; None: the benchmark's calibration
     depth_scale: Number = 5000.0  # raw units per metre
     max_time_difference: Number = 0.02  # seconds between a colour image and its depth image or pose
 
@@ -95,12 +94,10 @@ class TumLayout(Straightened):
 class Tum(TumLayout):
     """TUM RGB-D, where freiburg1, 2 and 3 in the sequence's name choose the calibration, and what has its layout."""
 
-    # k1, k2, p1, p2, k3 that goes with four numbers of `intrinsics`; None = what those say themselves
-    distortion: Sequence[Number] | None = None
-    # folder in the sequence with the true classes of every image, see `LabelFolder`; None = there are none
-    labels: str | None = None
-    classes: str = "classes.txt"  # file in the sequence that names them, in whose place then the names are
-    unknown: Sequence[int] | None = None  # their ids that mean no class, see `LabelFolder`
+    distortion: Sequence[Number] | None = None  # k1, k2, p1, p2, k3, beside four numbers of `intrinsics`
+    labels: str | None = None  # folder in the sequence with class images, see `LabelFolder`
+    classes: str = "classes.txt"  # file in the sequence that names the ids; then the names themselves
+    unknown: Sequence[int] | None = None  # ids that mean no class, see `LabelFolder`
 
     name = "tum"
     source = "TUM RGB-D benchmark, project page of the Computer Vision Group of TU Munich"
@@ -118,7 +115,7 @@ class Tum(TumLayout):
         if self._labels is None:
             return None
         ids = self._labels.read(self._images[index], self._raw_size)
-        # Beyond a straight image's border there is no class; the lens fills with 0, which here would be a class.
+        # The lens fills the border with 0, which must not become a class.
         straight = self._lens.straighten_depth((ids + 1).astype(np.float32)).astype(np.int32) - 1
         return reading.resize_nearest(straight, self.size)
 
@@ -131,10 +128,9 @@ class Tum(TumLayout):
 
 
 def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[list[str]], list[int]]:
-    """Seconds in ascending order, the words after them and the number of the line that each stands in.
+    """Read ascending seconds, the words after each, and its line number; '#' begins a comment.
 
-    Lines of a '#' comment and empty lines do not count. With two columns the second is the name of a file beside the
-    list, which may have spaces or stand in quotes.
+    With two columns the second is a file name, which may have spaces or quotes.
     """
     times, words, numbers = [], [], []
     for number, line in enumerate(reading.layout_text(path, LAYOUT).splitlines(), 1):
@@ -157,7 +153,7 @@ def read_list(path: Path, columns: int) -> tuple[Float[np.ndarray, " n"], list[l
 def nearest_lines(
     path: Path, columns: int, times: Float[np.ndarray, " n"], tolerance: float, what: str
 ) -> list[tuple[list[str], int] | None] | None:
-    """Words and line of a `read_list` nearest to each time, None where none is near; None where there is no list."""
+    """Words and line number of a list nearest to each time, None if none is near; None without the list."""
     if not path.exists():
         return None
     known, words, lines = read_list(path, columns)
@@ -166,7 +162,7 @@ def nearest_lines(
 
 
 def back_note(path: Path, times: Float[np.ndarray, " n"], lines: Sequence[int]) -> str | None:
-    """Words where times of a `read_list` go back from one line to the next, as where a clock was set."""
+    """Describe where times go back from one line to the next, as after a clock was set; None if they do not."""
     written = np.argsort(lines)
     steps = np.diff(times[written])
     if not len(steps) or steps.min() >= 0:
@@ -179,18 +175,13 @@ def back_note(path: Path, times: Float[np.ndarray, " n"], lines: Sequence[int]) 
 
 
 def _file_name(line: str, first_word: str, folder: Path) -> str:
-    """Return the rest of the line behind the time if it names a file, else its first word: more columns may follow."""
+    """The rest of the line behind the time if it names a file, else its first word: more columns may follow."""
     whole = re.split(r"[,\s]+", line.strip(), maxsplit=1)[1].strip(" \t,\"'")
     return whole if is_file(find_image(folder, whole)) else first_word.strip("\"'")
 
 
 def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"] | None:
-    """T_world_camera from tx ty tz qx qy qz qw; None where they are inf or nan, which means lost tracking.
-
-    Raises:
-        BadFrameError: they are no pose.
-        ValueError: it is farther away than positions can be held.
-    """
+    """T_world_camera from tx ty tz qx qy qz qw; None if inf or nan (lost tracking). Raises as `reading.as_pose`."""
     try:
         values = np.array([float(word) for word in words], np.float64)
     except ValueError as error:
@@ -208,7 +199,7 @@ def as_transform(words: list[str], where: object) -> Float[np.ndarray, "4 4"] | 
 def find_calibration(
     sequence: str, intrinsics: Given | None, distortion: Sequence[Number] | None, calibrations: Calibrations
 ) -> Given:
-    """Return the calibration of the images on disk: the given one, else the benchmark's by the sequence's name."""
+    """The calibration of the images on disk: the given one, else the benchmark's by the sequence's name."""
     if intrinsics is None:
         if distortion is not None:
             raise ValueError("dataset.distortion needs the dataset.intrinsics that it was calibrated with")

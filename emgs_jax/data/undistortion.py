@@ -1,4 +1,4 @@
-"""Undistortion: the pinhole camera that sees only what an image shows, and the tables that lead to its pixels."""
+"""Undistortion: a pinhole camera whose view lies within a distorted image, and the tables for cv2.remap."""
 
 import math
 
@@ -9,19 +9,19 @@ from jaxtyping import Float
 from emgs_jax.data.camera_models import Calibration, project, to_pycolmap, unproject
 from emgs_jax.data.reading import Intrinsics, Size
 
-MAX_VIEW_DEG = 120.0  # of the straight image, in its wider direction: beyond, pixels of the border are of nothing new
-NUM_BORDER = 9  # pixels of each side that say how far the image sees, as in OpenCV's getOptimalNewCameraMatrix
-MAX_BORDER = 2.0  # pixels that the straight view may look beyond, as it is fitted to these few
-MIN_VIEW = 0.1  # of the image's area; a lens that leaves less has other coefficients
+MAX_VIEW_DEG = 120.0  # of the straight image's wider side; beyond, its border would only be stretched
+NUM_BORDER = 9  # pixels of each side that bound the view, as in OpenCV's getOptimalNewCameraMatrix
+MAX_BORDER = 2.0  # pixels by which the straight view may exceed the image, as it is fitted to these few
+MIN_VIEW = 0.1  # of the image's area; less means wrong coefficients
 
-Maps = tuple[np.ndarray, np.ndarray]  # of cv2.remap: the column and row on disk of each straight pixel
+Maps = tuple[np.ndarray, np.ndarray]  # for cv2.remap: column and row on disk of each straight pixel
 
 
 def undistortion(camera: Calibration, size: Size, what: str = "dataset.intrinsics") -> tuple[Intrinsics, Maps, float]:
-    """New intrinsics whose view lies wholly inside of the distorted image, the tables that lead there, the share seen.
+    """Intrinsics whose view lies within the distorted image, tables for cv2.remap, and the share of the image seen.
 
     Raises:
-        ValueError: there is no such view: the coefficients fold the image, or leave less than MIN_VIEW of it.
+        ValueError: the coefficients fold the image, or leave less than MIN_VIEW of it.
     """
     lens, share = to_pycolmap(camera, size), 0.0
     scale = _scale(camera.intrinsics, _reach(lens, size), size)
@@ -38,7 +38,7 @@ def undistortion(camera: Calibration, size: Size, what: str = "dataset.intrinsic
 
 
 def _reach(lens: object, size: Size) -> Float[np.ndarray, " 4"]:
-    """How far the image sees everywhere to its left, right, top and bottom, at depth 1."""
+    """How far the whole image sees to its left, right, top and bottom, at depth 1."""
     columns, rows = (np.linspace(0, side - 1, NUM_BORDER) for side in size)
     left, right = (unproject(lens, np.column_stack([np.full(NUM_BORDER, u), rows]))[:, 0] for u in columns[[0, -1]])
     top, bottom = (unproject(lens, np.column_stack([columns, np.full(NUM_BORDER, v)]))[:, 1] for v in rows[[0, -1]])
@@ -46,7 +46,7 @@ def _reach(lens: object, size: Size) -> Float[np.ndarray, " 4"]:
 
 
 def _scale(intrinsics: Intrinsics, reach: Float[np.ndarray, " 4"], size: Size) -> float:
-    """Factor of the focal lengths with which a view of `size` with its centre in the middle stays within `reach`."""
+    """Factor of the focal lengths with which a centred view of `size` stays within `reach`."""
     half = np.array([size[0] - 1, size[0] - 1, size[1] - 1, size[1] - 1]) / 2
     focal = np.array(intrinsics)[[0, 0, 1, 1]]
     with np.errstate(divide="ignore"):
@@ -54,7 +54,7 @@ def _scale(intrinsics: Intrinsics, reach: Float[np.ndarray, " 4"], size: Size) -
 
 
 def _tables(lens: object, straight: Intrinsics, size: Size) -> Maps:
-    """Where each pixel of the straight image is in the distorted one, row by row: images may be large."""
+    """Column and row in the distorted image of each straight pixel; row by row, as images may be large."""
     fx, fy, cx, cy = straight
     maps = np.empty((2, size[1], size[0]), np.float32)
     rays = np.column_stack([(np.arange(size[0]) - cx) / fx, np.zeros(size[0])])
@@ -65,7 +65,7 @@ def _tables(lens: object, straight: Intrinsics, size: Size) -> Maps:
 
 
 def _seen_share(maps: Maps, size: Size) -> float:
-    """Share of the distorted image that the straight view shows; 0 where it looks beyond or sees something twice."""
+    """Share of the distorted image that the straight view shows; 0 if it exceeds or folds it."""
     x, y = maps
     if not (np.isfinite(x).all() and np.isfinite(y).all()):
         return 0.0

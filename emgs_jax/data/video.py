@@ -1,4 +1,4 @@
-"""The frames of a video file, as they can be read: what its header says of their number and rate is often wrong."""
+"""Read the frames of a video file, whose header is often wrong about their number and rate."""
 
 import math
 import struct
@@ -11,25 +11,20 @@ from jaxtyping import UInt8
 from emgs_jax.data.base import BadFrameError
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm")
-MIN_ASPECT = 0.2  # of a pixel: what is thinner is no format but a damaged header
+MIN_ASPECT = 0.2  # of a pixel; less means a damaged header
 
 
 class Video:
-    """A video, read from its beginning: seeking lands on a key frame nearby with many codecs, counting never does.
+    """A video, read from its beginning up to frame `stop`, as seeking lands on a nearby key frame with many codecs.
 
-    Args:
-        stop: frames from there on are not wanted, and not counted; None = all.
-
-    Attributes:
-        times: seconds since the beginning at which the file shows each frame that can be read, up to `stop`.
-        notes: where the header announces more frames than there are.
+    `times` are the seconds of each readable frame; `notes` describe a wrong header and pixels that are not square.
     """
 
     def __init__(self, path: Path, stop: int | None = None) -> None:
         self._path, self._capture = path, open_video(path)
         announced = self._capture.get(cv2.CAP_PROP_FRAME_COUNT)
         self.times = _times(self._capture, stop)
-        count = self._next = len(self.times)  # _next: number of the frame that the capture gives next
+        count = self._next = len(self.times)  # _next: the frame that the capture gives next
         if not count:
             raise ValueError(self._nothing_decoded())
         is_short = math.isfinite(announced) and count < (announced if stop is None else min(announced, stop))
@@ -51,7 +46,7 @@ class Video:
         )
 
     def read(self, row: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        """The frame as a player shows it, of square pixels."""
+        """The frame with square pixels, as a player shows it."""
         image = self._decoded(row)
         height, width = image.shape[:2]
         return image if self._aspect == 1 else cv2.resize(image, (max(round(width * self._aspect), 1), height))
@@ -74,7 +69,7 @@ class Video:
 
 
 def announced(path: Path) -> int:
-    """Return the number of frames that the header of a video names; 0 where it names none."""
+    """The number of frames in a video's header; 0 if it has none."""
     count = open_video(path).get(cv2.CAP_PROP_FRAME_COUNT)
     return int(count) if math.isfinite(count) and count > 0 else 0
 
@@ -88,7 +83,7 @@ def open_video(path: Path) -> cv2.VideoCapture:
 
 
 def _pixel_aspect(capture: cv2.VideoCapture) -> float:
-    """Width of a pixel over its height, of the frames as they are decoded; 1 where the file does not say."""
+    """Width of a decoded pixel over its height; 1 if the file does not tell."""
     across, down = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
     if not (across > 0 and down > 0 and MIN_ASPECT <= across / down <= 1 / MIN_ASPECT):
         return 1.0
@@ -96,10 +91,7 @@ def _pixel_aspect(capture: cv2.VideoCapture) -> float:
 
 
 def damage(path: Path) -> str | None:
-    """What is wrong with a video file that does not open; None where nothing is seen.
-
-    A recording that was cut off, or copied in part, lacks the box `moov` that mp4 and mov end with.
-    """
+    """Describe the damage of a video file, None if none is found: cut off mp4 and mov files lack the last box, moov."""
     remedy = "copy it again from where it was recorded; no program can convert it as it is"
     size = path.stat().st_size
     if not size:
@@ -118,10 +110,9 @@ def damage(path: Path) -> str | None:
 
 
 def _times(capture: cv2.VideoCapture, stop: int | None) -> list[float]:
-    """Seconds at which each frame is shown, read to the end or to `stop`.
+    """Seconds of each frame, to the end or to `stop`, as the rate may change within a video.
 
-    The rate may change within a video, so a frame's number says nothing about its time. Where the file has no times
-    that ascend (a bare stream of h264) they are numbers of frames / its nominal rate, or numbers where it has none.
+    Without ascending times (a bare h264 stream) they are frame numbers divided by the nominal rate, or by 1.
     """
     times = []
     while (stop is None or len(times) < stop) and capture.grab():

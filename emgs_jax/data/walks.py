@@ -1,4 +1,4 @@
-"""Walks through the apartment: corners of a route, rounded, and a camera carried along it that looks ahead."""
+"""Walks through the apartment: a camera is carried along a route with rounded corners and looks ahead."""
 
 from collections.abc import Callable
 
@@ -10,13 +10,13 @@ from emgs_jax.data.plan import APART, BAY, HALF_HALL, NUM_BAYS, Area, Plan, Poin
 from emgs_jax.data.raycast import level_poses
 
 SPACING = 0.07  # metres from frame to frame on a straight line
-TURN = 0.9  # a turn by one radian takes as many frames as this many metres: one walks slower round a corner
+TURN = 0.9  # metres that take as many frames as a turn by one radian: one walks slower round a corner
 RADIUS = 0.9  # of the corners, metres
 AROUND = 1.3  # from the middle of a table to the route around it, along x and y
-LOOK_AHEAD = 0.5  # metres: one looks into a corner before one walks round it, not at the wall behind it
+LOOK_AHEAD = 0.5  # metres; one looks into a corner before walking round it
 STEP = 0.01  # metres between the points of a route before it is smoothed
 EYE_HEIGHT = 1.5
-SWAY = (  # of a hand-held camera: amplitude and wave lengths in metres walked, the short ones are steps
+SWAY = (  # of a hand-held camera: amplitude, and wave lengths in metres walked; the short ones are steps
     ("sideways", 0.012, (1.5, 4.1)),
     ("height", 0.012, (0.75, 5.3)),
     ("yaw", np.radians(1.2), (1.5, 3.7)),
@@ -28,7 +28,7 @@ Corners = list[Point]
 
 
 def table_of(area: Area, side: int) -> Point:
-    """Middle of the table that a walk goes around: 2.1 m from the wall at the `side` (-1 west, 1 east), or midway."""
+    """Middle of the table that a walk goes around: 2.1 m from the wall at the `side` (-1 west, 1 east), or central."""
     (x0, y0), (x1, _) = area.low, area.high
     x = {-1: x0 + 2.1, 0: (x0 + x1) / 2, 1: x1 - 2.1}[side]
     return x, y0 + 2.15
@@ -57,7 +57,7 @@ def out_and_back(plan: Plan) -> Corners:
 
 
 def twin_rooms(plan: Plan) -> Corners:
-    """Into the one twin room, around its table, out again, and the same in the other, which looks alike."""
+    """Into a twin room, around its table and out again, and the same in the other."""
     return [(plan.twin_door - 2.0, 0.0), *_visit(plan, 0.0), *_visit(plan, APART), (2 * APART - 0.5, 0.0)]
 
 
@@ -82,7 +82,7 @@ WALKS: dict[str, Callable[[Plan], Corners]] = {
 
 
 def rounded(corners: Corners, radius: float) -> Float[np.ndarray, "n 2"]:
-    """Points `STEP` apart on the line through the corners, each an arc of the radius, or less where two are close."""
+    """Points `STEP` apart on the line through the corners, rounded with the radius, or less if two are close."""
     points = np.array(corners)
     pieces = [points[:1]]
     for before, corner, after in zip(points[:-2], points[1:-1], points[2:], strict=True):
@@ -104,7 +104,7 @@ def rounded(corners: Corners, radius: float) -> Float[np.ndarray, "n 2"]:
 def carry(corners: Corners, num_frames: int | None, rng: np.random.Generator) -> Float[np.ndarray, "n 4 4"]:
     """T_world_camera along a route at eye level, looking ahead, with the sway of a hand.
 
-    Frames are equally far from each other where a turn by a radian counts as `TURN` metres; None = `SPACING` apart.
+    Frames are evenly spaced, a turn by a radian counting as `TURN` metres; `num_frames` None: `SPACING` apart.
     """
     line = gaussian_filter1d(rounded(corners, RADIUS), 0.15 / STEP, axis=0, mode="nearest")
     ahead = np.gradient(line, axis=0)
@@ -127,5 +127,5 @@ def carry(corners: Corners, num_frames: int | None, rng: np.random.Generator) ->
 def _sway(
     walked: Float[np.ndarray, " n"], amplitude: float, lengths: tuple[float, ...], rng: np.random.Generator
 ) -> Float[np.ndarray, " n"]:
-    """Sum of waves of the distance walked, each with a random phase."""
+    """Sum of waves over the distance walked, with random phases."""
     return sum(amplitude * np.sin(2 * np.pi * walked / length + rng.uniform(0, 2 * np.pi)) for length in lengths)
