@@ -18,7 +18,7 @@ COMMANDS = tuple(name for names in GROUPS.values() for name in names)
 
 
 def usage() -> str:
-    """One line and an example for each command, in groups."""
+    """Describe each command by a line and an example, in groups."""
     lines = ["usage: emgs COMMAND [key=value …]"]
     for group, names in GROUPS.items():
         lines += ["", f"{group}:"]
@@ -29,7 +29,7 @@ def usage() -> str:
 
 
 def beginning_of(name: str) -> tuple[str, str]:
-    """What a command does and an example, from the first lines of its file in conf/."""
+    """A command's purpose and an example, from the first lines of its file in conf/."""
     from .command import CONF, RUN
 
     text = (CONF / f"{RUN if name == 'run' else name}.yaml").read_text(encoding="utf-8")
@@ -38,14 +38,13 @@ def beginning_of(name: str) -> tuple[str, str]:
 
 
 def explained(name: str) -> Callable[[], None]:
-    """Return a program that shows the help of a command without its imports."""
+    """Make a program that shows a command's help without its imports."""
     from .command import RUN, command
 
     return command(RUN if name == "run" else name)(lambda config: None)
 
 
 def main() -> None:
-    """Hand the rest of the command line to a command."""
     speak_on()
     name, *rest = sys.argv[1:] or ["--help"]
     if name in ("-h", "--help", "help"):

@@ -1,4 +1,4 @@
-"""Shared parts of the commands: Hydra, the compilation cache, and an error that is one clear line."""
+"""Shared by the commands: Hydra, the compilation cache, and errors as one clear line."""
 
 import argparse
 import contextlib
@@ -32,9 +32,9 @@ from .console import Console, speak_on
 from .interrupt import clear_interrupt
 from .keys import KEYS
 
-RUN = "config"  # conf/config.yaml, whose help lists every choice, by Hydra
-# Libraries that log at INFO which accelerators and threads are not there. A level of the logger "jax" that is set
-# before JAX is imported becomes the level of jaxlib, too, which then logs an error for each executable from the cache.
+RUN = "config"  # conf/config.yaml
+# Libraries that log missing accelerators and threads at INFO. A level of the logger "jax" before JAX is imported would
+# become jaxlib's, which then logs an error for each cached executable.
 TALKATIVE = ("jax._src", "numexpr", "websockets")
 WRONG_INPUT = (ValueError, OSError, InstantiationException, OmegaConfBaseException)
 
@@ -42,7 +42,7 @@ WRONG_INPUT = (ValueError, OSError, InstantiationException, OmegaConfBaseExcepti
 def command(
     name: str, rewritten: Callable[[list[str]], list[str]] = list
 ) -> Callable[[Callable[[DictConfig], Any]], Callable[[], None]]:
-    """Make a program of a function of conf/`name`.yaml with the command line's overrides, `rewritten` if need be."""
+    """Make a program of a function of conf/`name`.yaml, composed with the command line after `rewritten`."""
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
         @wraps(task)
@@ -80,7 +80,7 @@ def command(
 
 
 def leave_float32() -> None:
-    """Turn off what JAX_ENABLE_X64 turns on, and say so: maps are made in float32."""
+    """Undo JAX_ENABLE_X64, and say so: maps are made in float32."""
     if os.environ.get("JAX_ENABLE_X64", "").lower() in ("1", "true", "yes", "on", "y", "t"):
         import jax  # noqa: PLC0415 (not all commands need it)
 
@@ -90,7 +90,7 @@ def leave_float32() -> None:
 
 @contextlib.contextmanager
 def kept_words(logging: DictConfig) -> Iterator[None]:
-    """Keep what a job says, how it failed included, in the file that Hydra has for its log; without one nowhere."""
+    """Copy a job's output, and how it failed, to Hydra's log file, if there is one."""
     path = log_of(logging)
     if path is None:
         yield
@@ -108,18 +108,18 @@ def kept_words(logging: DictConfig) -> Iterator[None]:
 
 
 def log_of(logging: DictConfig) -> Path | None:
-    """The file of Hydra's log; None where it keeps none."""
+    """Hydra's log file, or None."""
     path = OmegaConf.select(logging, "handlers.file.filename")
     return None if path is None else Path(path)
 
 
 def help_of(name: str) -> str:
-    """Return the help in conf/`name`.yaml: its first comment, and its own choices and keys as they stand there."""
+    """The help in conf/`name`.yaml: its first comment, and its own choices and keys."""
     text = (CONF / f"{name}.yaml").read_text(encoding="utf-8")
-    if name == RUN:  # which says what matters of its many keys
+    if name == RUN:  # has too many keys
         return OmegaConf.create(text).hydra.help.template
     head, text = re.sub(r"^hydra:\n(?:(?:  .*)?\n)*", "", text, flags=re.MULTILINE).split("defaults:\n")
-    own = re.sub(r"^  - (?!\w+: ).*\n", "", text, flags=re.MULTILINE)  # neither files nor what Hydra is told
+    own = re.sub(r"^  - (?!\w+: ).*\n", "", text, flags=re.MULTILINE)  # without files and Hydra's settings
     choices = re.sub(r"^  - ", "", own, flags=re.MULTILINE)
     needed = "".join(f" {key}=…" for key in re.findall(r"^  - (\w+): \?\?\?", own, re.MULTILINE))
     more = f"emgs {name}{needed} --cfg job shows every key with its value."
@@ -129,7 +129,7 @@ def help_of(name: str) -> str:
 
 
 def words_of(arguments: list[str]) -> argparse.Namespace:
-    """A command line as Hydra takes it apart: its options, and in `overrides` all other words."""
+    """Parse a command line as Hydra does: options, and in `overrides` all other words."""
     return get_args_parser().parse_intermixed_args(arguments)
 
 
@@ -139,7 +139,7 @@ def overrides_of(arguments: list[str]) -> list[str]:
 
 
 def first_words(key: str, is_list: bool = False) -> Callable[[list[str]], list[str]]:
-    """Return what makes a key of the first word, or with `is_list` of all up to the first override or option."""
+    """Make a function that assigns a key the first word, or with `is_list` all up to the first override or option."""
 
     def rewrite(arguments: list[str]) -> list[str]:
         count = next((n for n, word in enumerate(arguments) if word.startswith("-") or KEY.match(word)), len(arguments))
@@ -151,7 +151,7 @@ def first_words(key: str, is_list: bool = False) -> Callable[[list[str]], list[s
 
 
 def check_arguments(name: str, arguments: list[str]) -> None:
-    """Raise ValueError with near names where an override names no key or option, and where a word is no override."""
+    """Raise ValueError, with near names, if an override names no key or option, or a word is no override."""
     given = words_of(arguments)
     folder = given.config_dir
     if folder is not None and not Path(folder).is_dir():
@@ -166,11 +166,11 @@ def check_arguments(name: str, arguments: list[str]) -> None:
         parsed = OverridesParser.create().parse_overrides([word for word in given.overrides if "=" in word])
     except HydraException as error:
         raise ValueError(f"{str(error).splitlines()[0]}: write each as KEY=VALUE, in quotes: 'KEY=VALUE'") from error
-    # Of Hydra's own keys one has options of the user in it.
+    # Of Hydra's own keys the search path has options of the user.
     own = [o for o in parsed if not o.key_or_group.startswith("hydra") or o.key_or_group == "hydra.searchpath"]
     for override in parsed:
         run = str(override.value())
-        if override.key_or_group == "hydra.run.dir" and "$" not in run:  # Hydra tells it by a traceback
+        if override.key_or_group == "hydra.run.dir" and "$" not in run:  # Hydra would print a traceback
             check_writable(Path(run), f"hydra.run.dir={run}")
     overrides = [first_of_sweep(override) for override in own]
     if folder is not None and not any(o.key_or_group == "hydra.searchpath" for o in own):
@@ -179,21 +179,20 @@ def check_arguments(name: str, arguments: list[str]) -> None:
 
 
 def name_of(name: str) -> str:
-    """The command of conf/`name`.yaml."""
+    """The command that conf/`name`.yaml belongs to."""
     return "run" if name == RUN else name
 
 
 def check_missing(name: str, config: DictConfig) -> None:
-    """Raise ValueError where one of conf/`name`.yaml's own keys has to be given and is not."""
-    lines = (CONF / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
-    for line in lines:
+    """Raise ValueError if a required key of conf/`name`.yaml is missing."""
+    for line in (CONF / f"{name}.yaml").read_text(encoding="utf-8").splitlines():
         if (found := re.match(r"(\w+): \?\?\?(?: # (.*))?", line)) and OmegaConf.is_missing(config, found[1]):
             what = f" ({found[2]})" if found[2] else ""
             raise ValueError(f"{found[1]} is not given{what}: emgs {name_of(name)} {found[1]}=…")
 
 
 def check_out(config: DictConfig) -> None:
-    """Raise ValueError where what `out` names could not be written in the end; it may be a file."""
+    """Raise ValueError if `out`, a folder or an .npz file, could not be written."""
     if isinstance(out := config.get("out"), str):
         is_file = Path(out).suffix == ".npz"
         check_writable(Path(out).parent if is_file else Path(out), f"out={out}")
@@ -201,9 +200,9 @@ def check_out(config: DictConfig) -> None:
 
 @contextlib.contextmanager
 def nothing_left() -> Iterator[None]:
-    """Remove the folder that Hydra made where nothing came of the command: it has no result.
+    """Remove the folder that Hydra made if the command failed without a result.
 
-    Where it held anything before, another program is in it, or Hydra keeps no log and so made none, all of it stays.
+    It stays if it held anything before, if another program uses it, or if Hydra keeps no log and so made none.
     """
     hydra = HydraConfig.get()
     folder, log = Path(hydra.runtime.output_dir), log_of(hydra.job_logging)
@@ -211,7 +210,7 @@ def nothing_left() -> Iterator[None]:
     def is_bare() -> bool:
         return log is not None and {path.name for path in folder.iterdir()} <= {log.name, ".hydra"}
 
-    # In a multirun Hydra writes there at the end.
+    # After a multirun Hydra writes there.
     is_new = hydra.mode != RunMode.MULTIRUN and is_bare() and not log.stat().st_size
     try:
         yield
@@ -228,9 +227,9 @@ def nothing_left() -> Iterator[None]:
 
 @contextlib.contextmanager
 def clear_errors() -> Iterator[None]:
-    """End the program with the message of what is wrong with the input; HYDRA_FULL_ERROR=1 shows the traceback.
+    """End the program with the message of an error in the input; HYDRA_FULL_ERROR=1 shows the traceback.
 
-    In a multirun the error goes on to Hydra, which reports it after the other jobs; an exit would end them too.
+    In a multirun Hydra reports the error after the other jobs, which an exit would end too.
     """
     try:
         yield

@@ -1,4 +1,4 @@
-"""What the console can show, whether there still is one, and a copy of what it is told."""
+"""A console that may lack characters or go away, and a copy of its output."""
 
 import io
 import os
@@ -7,10 +7,7 @@ from typing import Any, TextIO
 
 
 class Console:
-    """A console for as long as someone reads it: when a reader such as `head` has gone, the rest goes nowhere.
-
-    A long run would end there with its work undone. What is written goes into `file`, too.
-    """
+    """A console whose reader, such as `head`, may go away without ending the program; copies all output to `file`."""
 
     def __init__(self, console: Any, file: TextIO | None = None) -> None:
         self._console, self._file = console, file
@@ -40,7 +37,7 @@ class Console:
 
 
 def speak_on() -> None:
-    """Write a sign that the console does not have as "?", and on when nobody reads: both would end the program."""
+    """Replace characters that the console lacks by "?", and go on when nobody reads; both would end the program."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if isinstance(stream, io.TextIOWrapper):

@@ -14,7 +14,7 @@ from .command import command
 
 
 def embed(config: DictConfig) -> Path:
-    """Write the embeddings of `config.classes` to `config.out`."""
+    """Write the embeddings of `config.classes` to `config.out`, and print what was written."""
     if "_target_" not in config.features:
         raise ValueError("features=none has no text encoder: choose features=dinov3_text or dinov2_text")
     names = tuple(str(name) for name in config.classes)
@@ -29,11 +29,7 @@ def embed(config: DictConfig) -> Path:
     return path
 
 
-@command("embed")
-def main(config: DictConfig) -> None:
-    """Embed, and say what was written."""
-    embed(config)
-
+main = command("embed")(embed)
 
 if __name__ == "__main__":
     main()

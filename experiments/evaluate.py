@@ -1,7 +1,7 @@
 """Evaluate data sets × sequences × variants × seeds: `python -m experiments.evaluate suite=smoke seeds=[0,1,2]`.
 
-What is finished is skipped, so the same command resumes; a job that fails does not stop the others. The folder `out`
-gets one folder per job, results.csv, results.json, results.md and report.html.
+Finished jobs are skipped, so the same command resumes; a failed job does not stop the others. `out` gets a folder per
+job, results.csv, results.json, results.md and report.html.
 """
 
 import contextlib
@@ -34,12 +34,12 @@ from .command import command, overrides_of
 from .run import run
 
 ERROR_FILE = "error.txt"
-SEQUENCE = "dataset.sequence"  # key of the runs that the sequences of a suite are values of, unless it names another
+SEQUENCE = "dataset.sequence"  # key that a suite's sequences are values of, unless it names another
 
 
 @dataclass(frozen=True)
 class Job:
-    """One run: its name, its config and its folder."""
+    """One run."""
 
     name: str
     dataset: str
@@ -48,12 +48,11 @@ class Job:
 
 
 def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
-    """All jobs, those of one data set one after the other; `settings` is a resolved conf/evaluate.yaml."""
+    """All jobs of a resolved conf/evaluate.yaml, by data set."""
     for dataset, data in settings["suite"]["data"].items():
+        own = [f"{key}={written(value)}" for key, value in data["overrides"].items()]
         for variant, changes in settings["variants"].items():
-            own, changed = (
-                [f"{key}={written(value)}" for key, value in some.items()] for some in (data["overrides"], changes)
-            )
+            changed = [f"{key}={written(value)}" for key, value in changes.items()]
             _check_free([*settings["overrides"], *changed], dataset, data.get("key", SEQUENCE))
             overrides = [f"dataset={dataset}", *own, *settings["overrides"], *changed]
             common = compose(*overrides)
@@ -73,7 +72,7 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
 
 
 def _check_free(overrides: Sequence[str], dataset: str, key: str) -> None:
-    """Raise ValueError where an override names what the jobs differ in, which would write over it."""
+    """Raise ValueError if an override names a key in which the jobs differ."""
     taken = {"dataset": "suite=NAME", key: f"suite.data.{dataset}.sequences=[…]", "prior.seed": "seeds=[…]"}
     for text in overrides:
         if (name := text.lstrip("+~").partition("=")[0]) in taken:
@@ -81,7 +80,7 @@ def _check_free(overrides: Sequence[str], dataset: str, key: str) -> None:
 
 
 def delegated(arguments: Sequence[str]) -> list[str]:
-    """The arguments with those that are no key of conf/evaluate.yaml, such as `prior=recorded`, in `overrides`."""
+    """Move arguments that are no key of conf/evaluate.yaml, such as `prior=recorded`, into `overrides`."""
     own = {*compose("suite=smoke", name="evaluate"), "hydra"}
     rest = [text for text in overrides_of(arguments) if re.split(r"[=./@]", text.lstrip("+~"))[0] not in own]
     kept = [text for text in arguments if text not in rest]
@@ -89,16 +88,13 @@ def delegated(arguments: Sequence[str]) -> list[str]:
         raise ValueError(
             f"{rest[0]} is for the runs: write it into overrides=[…], or all of those as words of their own"
         )
-    # Interpolations are the run's, so they are not resolved here.
+    # Interpolations are resolved by the runs.
     words = [quoted(text.replace("${", r"\${")) for text in rest]
     return [f"overrides=[{','.join(words)}]", *kept] if rest else kept  # options such as --cfg come last
 
 
 def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
-    """Run every job of this shard that is not finished and write the tables; returns what went wrong, line by line.
-
-    The page says that `command_line` repeats it.
-    """
+    """Run this shard's unfinished jobs and write the tables; return the problems. The page names the `command_line`."""
     out, part, whole = Path(settings["out"]), *_shard(settings["shard"])
     if whole > 1 and (settings["gate"] or settings["write_gate"]):
         raise ValueError("a gate needs the results of all jobs: run once more without shard")
@@ -113,8 +109,8 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
     jobs = list(plan(settings))
     if not jobs:
         raise ValueError("there is nothing to evaluate: give one seed or more, seeds=[0]")
-    read_estimates(out)  # results that cannot be read end the evaluation before it begins
-    ours = jobs[(part - 1) * len(jobs) // whole : part * len(jobs) // whole]  # neighbours share their executables
+    read_estimates(out)  # fails before the evaluation begins
+    ours = jobs[(part - 1) * len(jobs) // whole : part * len(jobs) // whole]  # neighbours share executables
     open_jobs = [job for job in ours if not _is_finished(job)]
     finished, now = [job for job in jobs if (job.folder / METRICS_FILE).is_file()], code_now()
     if older := [job.name for job in finished if code_of(read_metrics(job.folder / METRICS_FILE)["provenance"]) != now]:
@@ -144,14 +140,14 @@ def _run_all(jobs: Sequence[Job], failures: dict[str, str]) -> None:
     for number, job in enumerate(jobs):
         tqdm.write(f"{number + 1}/{len(jobs)} {job.name}")
         if number and job.dataset != jobs[number - 1].dataset:
-            jax.clear_caches()  # other shapes: the old executables would only hold memory
+            jax.clear_caches()  # executables of other shapes only use memory
         try:
             job.folder.mkdir(parents=True, exist_ok=True)
-            # There before anything fails, is killed or fills the disk: what comes after metrics.json belongs to a job.
+            # Written first, as a job may be killed or fill the disk; a job also includes what follows metrics.json.
             write_file(job.folder / ERROR_FILE, "the job has begun and not ended\n")
             run(job.config, job.folder)
             (job.folder / ERROR_FILE).unlink(missing_ok=True)
-        except Exception as error:  # whatever it is, the other jobs go on
+        except Exception as error:  # the other jobs go on
             failures[job.name] = message_of(error)
             tqdm.write(f"failed: {failures[job.name]}")
             with contextlib.suppress(OSError):
@@ -159,10 +155,9 @@ def _run_all(jobs: Sequence[Job], failures: dict[str, str]) -> None:
 
 
 def _is_finished(job: Job) -> bool:
-    """Test whether the result of a job is there, and nothing of the job was left to do after it."""
-    return not (job.folder / ERROR_FILE).exists() and is_finished(
-        job.folder, OmegaConf.to_container(job.config, resolve=True)
-    )
+    """Test whether a job has its result and ended."""
+    settings = OmegaConf.to_container(job.config, resolve=True)
+    return not (job.folder / ERROR_FILE).exists() and is_finished(job.folder, settings)
 
 
 def _shard(text: str) -> tuple[int, int]:
@@ -173,10 +168,7 @@ def _shard(text: str) -> tuple[int, int]:
 
 
 def _write_tables(out: Path, jobs: Sequence[Job], failures: Mapping[str, str]) -> tuple[list[Row], Found]:
-    """Write results.csv, results.json and results.md; returns the rows by sequence, and what the page shows.
-
-    They show the jobs of this evaluation and other systems: older results in `out` may have other settings.
-    """
+    """Write results.csv, results.json and results.md of these jobs and of scored systems; return rows and page."""
     folders = {job.folder for job in jobs}
     estimates = [item for item in read_estimates(out) if item.kind == "scored" or item.folder in folders]
     totals, rows = average(estimates, each_sequence=False), average(estimates, each_sequence=True)
@@ -198,9 +190,9 @@ def _write_tables(out: Path, jobs: Sequence[Job], failures: Mapping[str, str]) -
 
 @command("evaluate", delegated)
 def main(config: DictConfig) -> None:
-    """Evaluate; the exit status is 1 if a job failed or a metric got worse."""
+    """Evaluate; the exit status is 1 if a job fails or a metric gets worse."""
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
-    given = HydraConfig.get().overrides.task  # those of the runs are quoted twice in overrides=[…]
+    given = HydraConfig.get().overrides.task  # in which overrides=[…] is quoted twice
     words = [*(word for word in given if not word.startswith(("shard=", "overrides="))), *settings["overrides"]]
     problems = evaluate(settings, shlex.join(["emgs", "evaluate", *words]))
     if problems:

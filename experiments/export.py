@@ -1,4 +1,4 @@
-"""A finished run for other programs: `python -m experiments.export FOLDER formats=[colmap,nerfstudio,frustums]`."""
+"""Export a finished run: `python -m experiments.export FOLDER formats=[colmap,nerfstudio,frustums]`."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +18,7 @@ from .command import command, first_words
 
 
 def export_run(config: DictConfig) -> list[Path]:
-    """Write what the config names; returns the files and folders."""
+    """Write the formats of a config; return the files and folders."""
     check_keys(config, ExportConfig)
     formats, length = list(dict.fromkeys(map(str, config.formats))), config.length and [float(n) for n in config.length]
     wanted = ExportConfig(formats, config.max_points, config.scale, length, str(config.images), str(config.moving))
@@ -46,7 +46,7 @@ def export_run(config: DictConfig) -> list[Path]:
 
 
 def at_original_size(run: FinishedRun) -> tuple[FinishedRun, ReadableFrames]:
-    """A run with its images in the size on disk, straightened, and their camera; ValueError where it names no size."""
+    """A run with undistorted images at their size on disk, and their camera; ValueError if the size is unknown."""
     size = run.provenance["data"].get("camera", {}).get("size")
     settings = OmegaConf.create(dict(run.provenance["config"]))
     if size is None or "size" not in settings.dataset:
@@ -59,7 +59,6 @@ def at_original_size(run: FinishedRun) -> tuple[FinishedRun, ReadableFrames]:
 
 @command("export", first_words("folder"))
 def main(config: DictConfig) -> None:
-    """Write, and say where."""
     for path in export_run(config):
         print(path)
 

@@ -1,4 +1,4 @@
-"""Ctrl-C, and the SIGTERM of a scheduler, end a command with one word after it has written what it has."""
+"""End a command on Ctrl-C or a scheduler's SIGTERM with one word, after it has written its results."""
 
 import _weakrefset
 import contextlib
@@ -14,17 +14,17 @@ from types import FrameType
 
 
 class Terminated(KeyboardInterrupt):
-    """SIGTERM, which what waits for Ctrl-C takes as that."""
+    """SIGTERM, handled like Ctrl-C."""
 
 
 RAISED = {signal.SIGTERM: Terminated, signal.SIGINT: KeyboardInterrupt}
 _delays: Counter[int] = Counter()
-AGAIN, MOST = 0.01, 100  # s, and how often
-_WEAK = weakref.__file__, _weakrefset.__file__  # whose dictionaries and sets take out what is gone
+AGAIN, MOST = 0.01, 100  # s between tries, and their number
+_WEAK = weakref.__file__, _weakrefset.__file__  # with callbacks that remove dead references
 
 
 def _interrupt(number: int, frame: FrameType | None) -> None:
-    """Raise what the signal stands for; a little later where Python would print that and go on, but not for ever."""
+    """Raise the signal's exception; try again later, but not for ever, if Python would only print it."""
     _delays[number] += 1
     if _is_lost(frame) and _delays[number] < MOST:
         threading.Timer(AGAIN, _send, (number,)).start()
@@ -34,14 +34,14 @@ def _interrupt(number: int, frame: FrameType | None) -> None:
 
 
 def _send(number: int) -> None:
-    """Send this process a signal; os.kill of Windows would end it."""
+    """Send this process a signal; on Windows os.kill would end it."""
     signal.raise_signal(number) if os.name == "nt" else os.kill(os.getpid(), number)
 
 
 def _is_lost(frame: FrameType | None) -> bool:
-    """Test whether a frame is in a callback of the garbage collector (JAX has one), a finalizer or a weak reference.
+    """Test whether a frame is in a callback of the garbage collector, a finalizer or a weak reference.
 
-    Python prints what is raised there, and goes on.
+    Python prints an exception there, and goes on. JAX has such a callback.
     """
     callbacks = {getattr(callback, "__code__", None) for callback in gc.callbacks}
     callbacks.add(weakref.finalize.__call__.__code__)
@@ -54,28 +54,27 @@ def _is_lost(frame: FrameType | None) -> bool:
 
 
 def _end(number: int, _: FrameType | None = None) -> None:
-    """Leave the process with one word, at once: whatever has to be written is written and closed by now.
+    """Print one word and leave at once, after everything is written.
 
-    Python's own end would take what other threads compute with from under them, and the program would end with SIGSEGV:
-    it waits for no daemon, as those of SciPy's trees are, and for none whose `join` was interrupted. What is raised
-    in that end would be printed, and forgotten.
+    Python's own shutdown would not wait for daemon threads, as of SciPy's trees, or for threads whose `join` was
+    interrupted, and end with SIGSEGV; it would only print an exception.
     """
     word = "terminated" if number == signal.SIGTERM else "interrupted"
     with contextlib.suppress(OSError):
         os.write(2, f"{word}\n".encode())
     with contextlib.suppress(OSError, ValueError, RuntimeError):  # closed, or a print is being interrupted
         sys.stdout.flush()
-    os._exit(128 + number)  # as shells have it
+    os._exit(128 + number)  # as in shells
 
 
 def _heard() -> list[signal.Signals]:
-    """Signals that this thread may listen to; who started the program may have them ignored."""
+    """Signals that this thread may handle, unless the parent process has them ignored."""
     is_main = threading.current_thread() is threading.main_thread()
     return [number for number in RAISED if is_main and signal.getsignal(number) not in (signal.SIG_IGN, None)]
 
 
 def end_clearly() -> None:
-    """End with one word from here on, outside of `clear_interrupt` too: the imports of a command take seconds."""
+    """End with one word outside of `clear_interrupt` too, as imports take seconds."""
     for number in _heard():
         signal.signal(number, _end)
 

@@ -1,4 +1,4 @@
-"""The keys of the commands themselves, which are no parameter of a class: of what kind each is."""
+"""Types and ranges of the commands' own keys, which are no parameters of a class."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

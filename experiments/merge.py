@@ -1,4 +1,4 @@
-"""Several finished runs as one: `python -m experiments.merge FOLDER FOLDER out=FOLDER`."""
+"""Merge finished runs: `python -m experiments.merge FOLDER FOLDER out=FOLDER`."""
 
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,7 @@ from .command import command, first_words
 
 
 def merge_runs(config: DictConfig) -> tuple[dict[str, Any], list[str]]:
-    """Check what `config` names, and merge it; returns metrics, and what there is to say."""
+    """Check and merge the runs of a config; return metrics and notes."""
     folders, out = [Path(str(folder)) for folder in config.folders], Path(str(config.out))
     if len(folders) < 2:
         raise ValueError(f"there is one run to merge, {folders[0]}: give two or more: emgs merge RUN RUN out=FOLDER")
@@ -31,7 +31,6 @@ def merge_runs(config: DictConfig) -> tuple[dict[str, Any], list[str]]:
 
 @command("merge", first_words("folders", is_list=True))
 def main(config: DictConfig) -> None:
-    """Merge, and say where it is."""
     metrics, notes = merge_runs(config)
     print("\n".join(notes) if notes else "all runs are joined")
     if "trajectory/num_frames" in metrics:

@@ -1,4 +1,4 @@
-"""Sharp splats for a finished run: `python -m experiments.polish FOLDER`; splats.ply, polish.json and polish.png."""
+"""Fit sharp splats to a finished run: `python -m experiments.polish FOLDER`; splats.ply, polish.json and polish.png."""
 
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from .command import command, first_words
 
 
 def polish_run(config: DictConfig) -> dict[str, Any]:
-    """Fit splats to the images of `config.folder`; returns what polish.json says."""
+    """Fit splats to the images of `config.folder`; return the content of polish.json."""
     if not config.polish:
         raise ValueError("polish=none has no settings to fit splats by: choose polish=default")
     fitting, run = build(config, "polish"), read_run(Path(str(config.folder)))
@@ -34,7 +34,6 @@ def polish_run(config: DictConfig) -> dict[str, Any]:
 
 @command("polish", first_words("folder"))
 def main(config: DictConfig) -> None:
-    """Polish, and say what it has changed on the frames that were held out."""
     print("\n".join(polish_lines(polish_run(config))))
     print(f"everything is in {config.folder}, {SPLATS_FILE} has the splats")
 

@@ -1,9 +1,8 @@
-"""Record what a prior says of a sequence: `python -m experiments.predict dataset=… prior=… features=… out=DIR`.
+"""Record a prior's predictions of a sequence: `python -m experiments.predict dataset=… prior=… features=… out=DIR`.
 
-`prior=recorded prior.folder=DIR` replays it in `experiments.run`. An interrupted recording is completed by the same
-command. With `graph=default` it holds what the back end asks for beside the windows of the sequence: views of both
-visits of a place. Without that this script needs no JAX, unless the prior does, and mapping a recording needs no
-PyTorch: each may have its own environment.
+`prior=recorded prior.folder=DIR` replays it in `experiments.run`. The same command completes an interrupted recording.
+With `graph=default` it also has windows of both visits of a place, for the back end. Without, this script needs no JAX,
+unless the prior does, and mapping a recording needs no PyTorch: each may have its own environment.
 """
 
 from collections.abc import Callable, Iterable
@@ -24,7 +23,7 @@ from .command import command
 
 
 def predict(config: DictConfig) -> Path:
-    """Record the predictions of `config` into `config.out`."""
+    """Record the predictions of `config` into `config.out`, and print what was recorded."""
     dataset = build_dataset(config)
     prior = build_prior(config, dataset)
     folder = Path(config.out)
@@ -33,9 +32,9 @@ def predict(config: DictConfig) -> Path:
         record(prior, dataset, config.slam.window_size, folder, _bar("inference", prior.provenance.name))
         if config.graph:
             _record_visits(prior, dataset, config, folder)
-    size = sum(path.stat().st_size for path in folder.iterdir()) / 2**20
-    per_frame = f"{size / len(dataset):.2f} a frame"
-    print(f"{folder}: {size:.1f} MiB, {per_frame}, {dataset.name} {dataset.sequence}, {len(dataset)} frames")
+    size, frames = sum(path.stat().st_size for path in folder.iterdir()) / 2**20, len(dataset)
+    what = f"{dataset.name} {dataset.sequence}, {frames} frames"
+    print(f"{folder}: {size:.1f} MiB, {size / frames:.2f} a frame, {what}")
     print(f"prior {prior.provenance.name} {prior.provenance.settings}")
     for key, value in prior.report().items():
         print(f"{key} {value:.4g}")
@@ -43,14 +42,14 @@ def predict(config: DictConfig) -> Path:
 
 
 def _check_folder(folder: Path) -> None:
-    """Raise ValueError where a folder holds something else than a recording, such as a run: its files would mix."""
+    """Raise ValueError if a folder holds something other than a recording, such as a run."""
     others = [path.name for path in sorted(folder.iterdir()) if not path.name.startswith(".") and path.suffix != ".npz"]
     if others and "manifest.json" not in others:
         raise ValueError(f"out={folder} holds {', '.join(others[:3])} and no recording: give a folder of its own")
 
 
 def _record_visits(prior: Prior, dataset: Dataset, config: DictConfig, folder: Path) -> None:
-    """Record the predictions of both visits of a loop that a run's back end will need beside the sequence's windows."""
+    """Record predictions of both visits of a place, for the back end."""
     end, size = graph_config(config), config.slam.window_size
     if not end.prior_query.is_used:
         return
@@ -64,11 +63,7 @@ def _bar(unit: str, words: str) -> Callable[[Iterable], Iterable]:
     return partial(tqdm, unit=unit, desc=words)
 
 
-@command("predict")
-def main(config: DictConfig) -> None:
-    """Record, and say what was recorded."""
-    predict(config)
-
+main = command("predict")(predict)
 
 if __name__ == "__main__":
     main()

@@ -1,7 +1,7 @@
 """Ask a finished map: `python -m experiments.query map=FOLDER text=chair`.
 
-Beside the map it writes query.json (objects with centre, box and score), semantic.npz (relevance of each Gaussian),
-semantic.ply, query.png (relevance seen from poses) and features.png, and with label_images=true class images.
+Writes query.json (objects with centre, box and score), semantic.npz (relevance of each Gaussian), semantic.ply,
+query.png (relevance seen from poses), features.png and, with label_images=true, class images.
 """
 
 import time
@@ -35,11 +35,11 @@ from emgs_jax.runs.vocabulary import Vocabulary, feature_model, vocabulary, word
 
 from .command import command
 
-UNLIKE = ("object", "things", "stuff", "texture")  # LERF's canonical phrases: what anything is
+UNLIKE = ("object", "things", "stuff", "texture")  # LERF's canonical phrases
 
 
 def query(config: DictConfig) -> dict[str, Any]:
-    """Ask `config.map` and write the answer; returns what query.json says."""
+    """Query `config.map`, write and print the answer; return what query.json says."""
     instances = build(config, "instances")
     words = asked(config)
     run = read_run(Path(config.map))
@@ -74,7 +74,7 @@ def query(config: DictConfig) -> dict[str, Any]:
 
 
 def asked(config: DictConfig) -> tuple[str, ...]:
-    """The words of `text` and of the class file."""
+    """The words to ask for, from `text` and the class file."""
     words = words_of(config.text, "text")
     words += () if config.classes is None else read_classes(config.classes).names
     if not words:
@@ -83,7 +83,7 @@ def asked(config: DictConfig) -> tuple[str, ...]:
 
 
 def rivals(config: DictConfig, words: tuple[str, ...], texts: Vocabulary) -> TextEmbeddings:
-    """Return a query's rivals: the words of `against`, else all others of a fixed vocabulary, else generic words."""
+    """Embed a query's rivals: the words of `against`, else all others of a fixed vocabulary, else generic words."""
     if config.against is not None:
         names = words_of(config.against, "against")
         both = sorted({*names} & {*words})
@@ -95,7 +95,7 @@ def rivals(config: DictConfig, words: tuple[str, ...], texts: Vocabulary) -> Tex
 
 
 def given_views(config: DictConfig, run: FinishedRun) -> list[View] | None:
-    """The poses of `pose` or `frame`; None where the best ones are to be found."""
+    """The poses of `pose` or `frame`; None if the best ones are to be found."""
     if config.pose is not None and config.frame is not None:
         raise ValueError("pose and frame both say from where to draw: give one of them")
     if config.frame is not None:
@@ -111,13 +111,13 @@ def given_views(config: DictConfig, run: FinishedRun) -> list[View] | None:
 
 
 def named_views(run: FinishedRun, views: list[View] | None) -> dict[str, View]:
-    """The poses that class images are drawn from: the given ones by their numbers, else all frames by their images."""
+    """The poses to draw class images from: the given ones by number, else all frames by image name."""
     if views is not None:
         return {f"{number:06d}": view for number, view in enumerate(views)}
     rows = np.flatnonzero(run.is_placed)
     frames = [run.frames[row] for row in rows]
     names = [Path(frame["name"]).stem for frame in frames]
-    if len(set(names)) < len(names):  # an image a folder, say
+    if len(set(names)) < len(names):  # as with a folder for each image
         names = [f"{frame['index']:06d}" for frame in frames]
     return {name: View(name, run.poses[row]) for name, row in zip(names, rows, strict=True)}
 
@@ -136,11 +136,7 @@ def lines_of(said: dict[str, Any], unit: str) -> list[str]:
     return lines
 
 
-@command("query")
-def main(config: DictConfig) -> None:
-    """Ask, and print what was found."""
-    query(config)
-
+main = command("query")(query)
 
 if __name__ == "__main__":
     main()

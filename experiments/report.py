@@ -1,4 +1,4 @@
-"""Write the page of a run anew, or one table of many runs: `python -m experiments.report FOLDER`."""
+"""Write a run's page again, or a table of many runs: `python -m experiments.report FOLDER`."""
 
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from .command import command, first_words
 
 
 def report(folder: Path) -> Path:
-    """Write report.html into the folder of a finished run; without its images where they are gone."""
+    """Write report.html into the folder of a finished run, without images that are gone."""
     run = read_run(folder)
     check_writable(folder, f"folder={folder}")
     dataset, note = images_of(run)
@@ -34,7 +34,6 @@ def tabulate(folder: Path) -> None:
 
 @command("report", first_words("folder"))
 def main(config: DictConfig) -> None:
-    """Write the page of a run, or the table of a folder of runs."""
     folder = Path(str(config.folder))
     is_multirun = not (folder / METRICS_FILE).exists() and bool(runs_of(folder))
     tabulate(folder) if is_multirun else report(folder)

@@ -1,4 +1,4 @@
-"""Map one sequence: `python -m experiments.run dataset=… prior=…`; everything that it writes is in Hydra's folder."""
+"""Map one sequence into Hydra's folder: `python -m experiments.run dataset=… prior=…`."""
 
 import contextlib
 import math
@@ -71,7 +71,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             graph, fused = graph_config(config), baseline_configs(config)
             dataset = build_dataset(config, folder)
             prior = build_prior(config, dataset)
-            if config.map is None:  # which has a capacity of its own
+            if config.map is None:  # a saved map has its own capacity
                 num_features = prior.text_features.shape[-1]
                 stack.enter_context(prepared_beside(to_camera(dataset), num_features, slam))
             prior.keep(folder)
@@ -92,7 +92,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             tqdm.write(note)
         keeps_points = dataset.has_ground_truth or densify.points == "own"
         session, raw = _map(session, dataset, prior, (baselines, evaluation, keeps_points), folder, keeper, live)
-        # What needs no drawing of the map is compared with the truth while the map is drawn and written.
+        # The raw prior is scored while the map is drawn and written.
         with ThreadPoolExecutor(2, "raw prior") as threads:
             truth = threads.submit(new_scorer, dataset, evaluation, prior)
             of_prior = threads.submit(lambda: score_prior(session, raw, truth.result()))
@@ -134,7 +134,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
 
 @contextlib.contextmanager
 def _said(clock: Clock, phase: str, words: str) -> Iterator[None]:
-    """A phase of a run that says what it does before it does it; no words, no line."""
+    """A phase of a run that first prints `words`, if any."""
     if words:
         tqdm.write(f"{words} …")
     with clock.phase(phase):
@@ -150,14 +150,11 @@ def _map(
     keeper: Keeper,
     live: LiveView | None,
 ) -> tuple[MappingRun, RawPrior]:
-    """Map all frames and log each; return the run and the raw predictions. What an interrupted run has is written."""
+    """Map all frames and log each; return the run and the raw predictions. An interrupted run writes what it has."""
     if keeper.found is not None:
         tqdm.write(f"going on after frame {len(keeper.found.records)}: those before are read and predicted only")
     run, (baselines, evaluation, keeps_points) = start, compared
-    with (
-        FrameLog(folder / "frames.jsonl") as log,
-        tqdm(total=len(dataset), unit="frame", desc="mapping") as bar,
-    ):
+    with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
 
         def frames() -> Iterator[tuple[FrameRecord, RawView]]:
             nonlocal run
@@ -174,7 +171,7 @@ def _map(
         for index, reason in dataset.skipped.items():
             log.append(to_line(FrameRecord(index, None, None, "skipped", reason)))
         try:
-            # Closed, so that what stops the gathering ends the mapping before what it has is written.
+            # Closed, so that an error while gathering ends the mapping before its results are written.
             with contextlib.closing(frames()) as mapped, start.clock.phase("raw_prior"):
                 raw = gather(mapped, evaluation, keeps_points, baselines, compared_text(dataset, prior))
             run = finish_run(run)
@@ -194,7 +191,7 @@ def _map(
 
 @command("config", rewritten=with_source)
 def main(config: DictConfig) -> float:
-    """Run, print the table and the folder; returns the trajectory error for Hydra's sweepers, inf without one."""
+    """Run, print the results, and return the trajectory error (inf without one) for Hydra's sweepers."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     metrics = run(config, folder)
     print(metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")

@@ -1,6 +1,6 @@
 """Score any other system: `python -m experiments.score trajectory=FILE points=FILE method=NAME dataset=…`.
 
-The same data, protocol and code as for our own runs; the result lies beside them in `out`, and the next table of
+Data, protocol and code are those of our own runs; the result lies beside them in `out`, and the next table of
 `python -m experiments.evaluate` shows it.
 """
 
@@ -30,12 +30,12 @@ Metrics = dict[str, Any]
 
 
 def score(config: DictConfig) -> tuple[Metrics, Path]:
-    """Compare the trajectory and the cloud of `config` with its data set; returns the metrics and their file."""
+    """Compare a trajectory and a cloud with a data set; return the metrics and their file."""
     evaluation = build(config, "evaluation")
     dataset = build_dataset(config)
     settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     folder = result_folder(Path(config.out), dataset.name, dataset.sequence, config.method, 0)
-    is_finished(folder, settings)  # scoring again replaces its own result, never another one
+    is_finished(folder, settings)  # raises if another result is there
     cloud = None if config.points is None else read_cloud(config.points, config.normal_neighbours)
     poses, truth, counts = matched_poses(
         config.trajectory, dataset, config.max_time_difference, config.min_associated_percent
@@ -53,16 +53,16 @@ def score(config: DictConfig) -> tuple[Metrics, Path]:
 def matched_poses(
     path: str, dataset: ReadableFrames, max_difference: float, min_percent: float
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """Poses of the file and true poses of the same times (n, 4, 4) in order of time, and how many of either there are.
+    """Poses of a file and true poses of the same times (n, 4, 4), in order of time, and the number of each.
 
     Raises:
-        ValueError: of neither as many as `min_percent` have a partner, so that the times are no times of the frames.
+        ValueError: fewer than `min_percent` of either have a partner, so the times are not those of the frames.
     """
     if not Path(path).is_file():
         raise FileNotFoundError(f"trajectory={path} is no file: give a file with `timestamp tx ty tz qx qy qz qw`")
     times, poses = load_trajectory_tum(path)
-    order = np.argsort(times, kind="stable")  # motions are from one pose to the next in time
-    # ORB-SLAM3 and others write the nanoseconds of EuRoC's clock into this format.
+    order = np.argsort(times, kind="stable")
+    # ORB-SLAM3 and others write EuRoC's nanoseconds into this format.
     times, poses = in_seconds(times[order]), poses[order]
     what = f"{dataset.name} {dataset.sequence}"
     frames = (dataset[row] for row in range(len(dataset)))
@@ -87,7 +87,7 @@ def matched_poses(
 
 
 def _check_twice(times: np.ndarray, poses: np.ndarray, path: str) -> None:
-    """ValueError where two poses have one of the ascending times: it is open which of them a score is about."""
+    """Raise ValueError if two different poses have one of the ascending times."""
     differ = times[1:][(np.diff(times) == 0) & (poses[1:] != poses[:-1]).any((1, 2))]
     if len(differ):
         raise ValueError(
@@ -97,7 +97,7 @@ def _check_twice(times: np.ndarray, poses: np.ndarray, path: str) -> None:
 
 
 def coverage(metrics: Metrics, min_percent: float) -> str:
-    """Say how many poses and frames the numbers are about, with a warning where that are few of the frames."""
+    """Describe how many poses and frames were matched, with a warning if they are few."""
     matched, frames = metrics["trajectory/num_frames"], metrics["score/num_frames"]
     percent = 100.0 * matched / frames
     text = f"{matched} of {metrics['score/num_poses']} poses are associated with true poses, which is {percent:.0f} % "
@@ -117,7 +117,6 @@ def _span(times: np.ndarray) -> str:
 
 @command("score")
 def main(config: DictConfig) -> None:
-    """Score, print the table and where the result lies."""
     metrics, path = score(config)
     print(full_table(average(estimates_of(path), each_sequence=True)))
     print(coverage(metrics, config.min_matched_percent))

@@ -1,6 +1,6 @@
-"""Segmentation of finished maps as in the paper's Table III: `python -m experiments.segment 'map=[office0,room0]' …`.
+"""Score the segmentation of maps as in the paper's Table III: `python -m experiments.segment 'map=[office0,room0]' …`.
 
-One map a scene, compared with Replica's labelled meshes or with the labels of the data set's own frames.
+Each scene has a map, compared with Replica's labelled mesh or with the labels of the data set's frames.
 """
 
 from pathlib import Path
@@ -19,11 +19,11 @@ from emgs_jax.runs.vocabulary import feature_model, vocabulary
 
 from .command import command
 
-FRAMES = "frames"  # the word that takes the labels of the data set's own frames for truth
+FRAMES = "frames"  # value of `truth` for the labels of the data set's frames
 
 
 def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
-    """Score the maps of `config` and write file and table; returns both."""
+    """Score the maps of a config, and write results and table; return both."""
     counting = Counting(config.num_neighbours, tuple(config.ignored))
     how = Placement(config.alignment, config.with_scale, config.icp_distance_m, config.icp_max_steps)
     runs = [read_run(Path(str(folder))) for folder in (config.map if _is_list(config.map) else [config.map])]
@@ -48,7 +48,7 @@ def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
 
 
 def scene_names(config: DictConfig, runs: list[FinishedRun]) -> list[str]:
-    """Names of the scenes: those of `scenes`, else the sequences that were mapped."""
+    """Names of the scenes: `scenes`, else the mapped sequences."""
     if config.scenes is None:
         return [str(run.provenance["data"]["sequence"]) for run in runs]
     names = [str(name) for name in (config.scenes if _is_list(config.scenes) else [config.scenes])]
@@ -58,7 +58,7 @@ def scene_names(config: DictConfig, runs: list[FinishedRun]) -> list[str]:
 
 
 def true_points(config: DictConfig, run: FinishedRun, scene: str) -> LabelledPoints:
-    """The truth of one scene: vertices of its mesh, or voxels that its labelled frames see."""
+    """The true points of a scene: vertices of its mesh, or voxels that its labelled frames see."""
     if config.truth != FRAMES:
         if config.classes is None:
             raise ValueError(
@@ -88,7 +88,6 @@ def _is_list(value: Any) -> bool:
 
 @command("segment")
 def main(config: DictConfig) -> None:
-    """Score, and print the table."""
     _, said = segment(config)
     print(f"{said}\neverything is in {config.out}")
 

@@ -1,4 +1,4 @@
-"""`emgs run video.mp4`: what a video or a folder of images alone implies; keys that are given win."""
+"""`emgs run video.mp4`: the settings that a video or a folder of images implies; given keys win."""
 
 import math
 import os
@@ -9,21 +9,19 @@ from emgs_jax.config.overrides import written
 
 from .command import overrides_of, words_of
 
-NUM_PIXELS, SIDE = 320 * 240, 16  # of a frame, and what its sides are multiples of
-NUM_FRAMES = 150  # of a video: about as many are taken, evenly
-SECONDS = 3.0  # that an image takes, from COLMAP to the report, on one core of a laptop
+NUM_PIXELS, SIDE = 320 * 240, 16  # of a frame, whose sides are multiples of SIDE
+NUM_FRAMES = 150  # about as many frames of a video are taken, evenly
+SECONDS = 3.0  # for an image, from COLMAP to the report, on one core of a laptop
 
 
 def with_source(arguments: list[str]) -> list[str]:
-    """The arguments of `emgs run` with the keys that a path among them stands for, which are printed.
+    """Replace a path among the arguments of `emgs run` by the keys that it implies, and print them.
 
     Raises:
-        ValueError: a word is neither a key with a value, nor an option, nor a path, or there are several paths.
+        ValueError: the path does not exist, or there are several.
     """
-    # ~KEY takes a key away, ~/ is the home.
-    paths = [
-        word for word in words_of(arguments).overrides if "=" not in word and (word[0] != "~" or word.startswith("~/"))
-    ]
+    words = [word for word in words_of(arguments).overrides if "=" not in word]
+    paths = [word for word in words if word[0] != "~" or word.startswith("~/")]  # ~KEY removes a key
     if not paths:
         return arguments
     if len(paths) > 1:
@@ -33,19 +31,18 @@ def with_source(arguments: list[str]) -> list[str]:
         raise ValueError(f"{path} is no file or folder, and no key=value: emgs run --help lists the keys")
     given = [word for word in arguments if word != paths[0]]
     found = implied(path, keys_of(given))
-    print(f"{path} stands for {' '.join(found)}; what you give yourself wins")
+    print(f"settings for {path}: {' '.join(found)} (your own win)")
     if note := plan_note(path, keys_of([*found, *given])):
         print(note)
     return [*found, *given]
 
 
 def keys_of(arguments: Sequence[str]) -> dict[str, str]:
-    """Key and value of each override."""
     return dict(word.lstrip("+~").split("=", 1) for word in overrides_of(list(arguments)))
 
 
 def implied(path: Path, given: dict[str, str]) -> list[str]:
-    """The overrides that a video or folder of images stands for, without those whose key is given."""
+    """The overrides that a video or folder of images implies, without given keys."""
     if given.get("dataset", "images") != "images":
         return [f"dataset.root={written(str(path))}"]
     found = {"dataset": "images", "dataset.root": written(str(path)), "dataset.intrinsics": "estimate"}
@@ -55,27 +52,26 @@ def implied(path: Path, given: dict[str, str]) -> list[str]:
         from emgs_jax.prior.files.prior import image_intrinsics
 
         camera = image_intrinsics(Path(given["prior.folder"].strip("'\"")).expanduser(), size)
-        if camera is not None:  # what points lie by
+        if camera is not None:
             found["dataset.intrinsics"] = "[{:.6g},{:.6g},{:.6g},{:.6g}]".format(*camera)
     if given.get("prior", "multiview_stereo") == "multiview_stereo":
         found["prior"] = "multiview_stereo"
-        if "baseline" not in given:  # it fuses frames where they were placed, the back end moves them afterwards
+        if "baseline" not in given:  # a baseline fuses frames before the back end moves them
             found["graph"] = "up_to_scale"
         stride = round(len(chosen(path, given)) / NUM_FRAMES)
-        if is_video(path) and stride > 1 and given.get("prior/dense") != "files":  # which may be of every frame
+        if is_video(path) and stride > 1 and given.get("prior/dense") != "files":  # files may be of every frame
             found["dataset.stride"] = str(stride)
     return [f"{key}={value}" for key, value in found.items() if key not in given]
 
 
 def is_video(path: Path) -> bool:
-    """Test whether the path is that of a video."""
     from emgs_jax.data.video import VIDEO_SUFFIXES
 
     return path.is_file() and path.suffix.lower() in VIDEO_SUFFIXES
 
 
 def chosen(path: Path, given: dict[str, str]) -> range:
-    """The images of a video or folder that `dataset.start`, `stop` and `stride` choose; by the header of a video."""
+    """The images of a folder, or of a video by its header, that `dataset.start`, `stop` and `stride` choose."""
     from emgs_jax.data.images import listed
     from emgs_jax.data.video import announced
 
@@ -88,26 +84,25 @@ def chosen(path: Path, given: dict[str, str]) -> range:
 
 
 def plan_note(path: Path, keys: dict[str, str]) -> str:
-    """Say how many images are mapped and how long that takes, where COLMAP and stereo do it; else nothing."""
+    """Describe how many images COLMAP and stereo will map, and how long that takes; empty for other priors."""
     if keys.get("dataset") != "images" or keys.get("prior") != "multiview_stereo":
         return ""
     every, images = len(chosen(path, keys | {"dataset.stride": "1"})), chosen(path, keys)
     minutes = max(round(len(images) * SECONDS / 60 / (os.cpu_count() or 1)), 1)
     taken = f"{len(images)} of {every} images, every {images.step}th" if images.step > 1 else f"{every} images"
     less = f"; dataset.stride={2 * images.step} halves that" if len(images) > NUM_FRAMES // 2 else ""
-    return (
-        f"{taken}, at {keys['dataset.size'].strip('[]').replace(',', '×')}: about {minutes} min on this machine{less}"
-    )
+    size = keys["dataset.size"].strip("[]").replace(",", "×")
+    return f"{taken}, at {size}: about {minutes} min on this machine{less}"
 
 
 def frame_size(width: int, height: int) -> tuple[int, int]:
-    """(width, height) with the shape of an image and about as many pixels as the frames of the data sets."""
+    """(width, height) with the aspect of an image and about NUM_PIXELS pixels."""
     scale = math.sqrt(NUM_PIXELS / (width * height))
     return max(round(width * scale / SIDE), 1) * SIDE, max(round(height * scale / SIDE), 1) * SIDE
 
 
 def _size(path: Path) -> tuple[int, int]:
-    """(width, height) of a video or a folder of images, as they are shown."""
+    """(width, height) of the images in a video or folder."""
     from emgs_jax.data.images import listed
     from emgs_jax.data.reading import first_size
     from emgs_jax.data.video import Video

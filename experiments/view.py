@@ -1,4 +1,4 @@
-"""Look at a finished run in the browser: `python -m experiments.view FOLDER`, until Ctrl-C."""
+"""Show a finished run in the browser until Ctrl-C: `python -m experiments.view FOLDER`."""
 
 from pathlib import Path
 
@@ -12,13 +12,11 @@ from .command import command, first_words
 
 
 def view(config: DictConfig) -> Viewer:
-    """Serve the run of a config."""
     return Viewer(shown(read_run(Path(str(config.folder)))), config.port)
 
 
 @command("view", first_words("folder"))
 def main(config: DictConfig) -> None:
-    """Serve, say where, and wait."""
     viewer = view(config)
     print(f"{viewer.address} shows {config.folder} to this machine; Ctrl-C ends it", flush=True)
     try:

@@ -1,7 +1,4 @@
-"""From words to what a run is made of: conf/ composed with overrides, the data set and the prior that it names.
-
-Nothing here needs JAX, because predictions are recorded where there may be none.
-"""
+"""Compose conf/ with overrides, and build data set and prior; without JAX, which recording predictions may lack."""
 
 import copy
 import difflib
@@ -42,7 +39,7 @@ CONF = next(
     folder for folder in (Path(__file__).parents[1] / "conf", Path(__file__).parents[2] / "conf") if folder.is_dir()
 )
 
-RENAMED = {  # keys of earlier versions; of two that fit the longer one counts
+RENAMED = {  # keys of earlier versions; the longest match counts
     "slam.continuation": "slam.extrapolation",
     "slam.localization.min_eigenvalue": "slam.localization.max_pose_std",
     "graph.appearance": "graph.place_recognition",
@@ -58,18 +55,15 @@ RENAMED = {  # keys of earlier versions; of two that fit the longer one counts
     "prior.structure.masks": "masks.folder",
     "prior.dense.depth.depth_step": "prior.dense.depth_step",
 }
-NO_WORD = (ValueError, TypeError, AssertionError)  # what Hydra raises where an option of a group is no word
+NO_WORD = (ValueError, TypeError, AssertionError)  # raised by Hydra if an option of a group is no word
 
 
 def build(config: DictConfig, key: str, **more: Any) -> Any:
-    """Instantiate the node at `key`, after all of its values are checked.
-
-    Args:
-        key: dotted, of a node with `_target_`.
+    """Check all values of the node at a dotted `key` and instantiate it.
 
     Raises:
-        ValueError: a value is not of the kind or in the range that its field declares; the message has its full key.
-            Or a key is no parameter, or one is missing.
+        ValueError: a value is not of the type or in the range that its field declares, a key is no parameter, or one is
+            missing.
     """
     if not isinstance(OmegaConf.select(config, key), DictConfig):
         raise ValueError(f"{key}={OmegaConf.select(config, key)} would stand in the place of all its keys")
@@ -78,25 +72,25 @@ def build(config: DictConfig, key: str, **more: Any) -> Any:
     try:
         return instantiate(node, **more)
     except InstantiationException as error:
-        if isinstance(error.__cause__, TypeError):  # of an earlier version, or added with +
+        if isinstance(error.__cause__, TypeError):  # an unknown key, from an earlier version or added with +
             raise ValueError(f"the keys of {key} are not those of {node.get('_target_')}: {error.__cause__}") from error
         raise
 
 
 def graph_config(config: DictConfig) -> "BackEndConfig | None":
-    """The back end of a config; None with `graph=none`."""
+    """The back end's settings; None with `graph=none`."""
     return build(config, "graph", _convert_="all") if config.graph else None
 
 
 def compose(*overrides: str, name: str = "config") -> DictConfig:
-    """conf/`name`.yaml with overrides; raises ValueError where one names no key or option."""
+    """Compose conf/`name`.yaml with overrides; ValueError if one names no key or option."""
     overrides = tuple(readable(overrides))
     with _hydra():
         try:
             config = hydra.compose(name, list(overrides))
         except (ConfigCompositionException, MissingConfigException, *NO_WORD) as error:
             raise ValueError(_explained(error, name, overrides)) from error
-        except HydraException as error:  # of the grammar
+        except HydraException as error:  # from the grammar
             raise ValueError(str(error)) from error
     for group, options in groups().items():
         value = OmegaConf.select(config, group.replace("/", "."), default={})
@@ -110,7 +104,7 @@ def compose(*overrides: str, name: str = "config") -> DictConfig:
 
 @contextmanager
 def _hydra() -> Iterator[None]:
-    """Hydra over conf/; whatever state of it there is comes back at the end, so this works inside of its programs."""
+    """Initialise Hydra over conf/ and restore its state at the end, so that this works within its programs."""
     register()
     before = copy.deepcopy(Singleton.get_state())
     GlobalHydra.instance().clear()
@@ -122,7 +116,7 @@ def _hydra() -> Iterator[None]:
 
 
 def groups() -> dict[str, list[str]]:
-    """Every group of conf/ and the names of its options."""
+    """The groups of conf/ with their options."""
     found: dict[str, list[str]] = {}
     for path in sorted(CONF.rglob("*.yaml")):
         if path.parent != CONF and not path.stem.startswith("_"):
@@ -131,7 +125,7 @@ def groups() -> dict[str, list[str]]:
 
 
 def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
-    """Explain the error in the overrides, and name the keys or options that might have been meant."""
+    """Explain an error in the overrides, with keys or options that might have been meant."""
     parsed = OverridesParser.create().parse_overrides(list(overrides))
     options = groups()
     if needed := re.match(r"You must specify '([\w/]+)'", str(error)):
@@ -142,7 +136,7 @@ def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
         if owners:
             return f"{other[1]}/{other[2]} is a choice of {other[1]}={', '.join(owners)} only"
     choices = [override for override in parsed if override.key_or_group.split("@")[0] in options]
-    paths = [override for override in parsed if override.key_or_group == "hydra.searchpath"]  # of options beside ours
+    paths = [override for override in parsed if override.key_or_group == "hydra.searchpath"]  # with the user's options
     for override in () if paths else choices:
         group = override.key_or_group
         if override.value() is not None and str(override.value()) not in options.get(group, [str(override.value())]):
@@ -164,7 +158,7 @@ def _explained(error: Exception, name: str, overrides: Sequence[str]) -> str:
 
 
 def renamed(key: str) -> str | None:
-    """Return today's name of a key or group of an earlier version; None where it has no other."""
+    """The current name of a key or group of an earlier version; None if it was not renamed."""
     for old in sorted(RENAMED, key=len, reverse=True):
         if key.replace("/", ".") == old or key.startswith(f"{old}."):
             new = RENAMED[old] + key[len(old) :]
@@ -173,14 +167,13 @@ def renamed(key: str) -> str | None:
 
 
 def first_of_sweep(override: Override) -> str:
-    """The override of the first job where there are several values, else the override."""
+    """The override with the first value of a sweep."""
     if not override.is_sweep_override():
         return override.input_line
     return f"{override.get_key_element()}={next(iter(override.sweep_string_iterator()))}"
 
 
 def keys_of(config: DictConfig) -> set[str]:
-    """Dotted keys of all nodes."""
     found = set()
 
     def walk(node: Any, path: tuple[str, ...]) -> None:
@@ -194,7 +187,7 @@ def keys_of(config: DictConfig) -> set[str]:
 
 
 def near(key: str, known: Sequence[str]) -> str:
-    """Words that name what `key` may have meant."""
+    """Name the keys that `key` may have meant."""
     known = [name for name in known if not name.rpartition(".")[2].startswith("_")]
     parent, _, last = key.rpartition(".")
     ends = {name: name.rpartition(".")[2] for name in known}
@@ -208,14 +201,10 @@ def near(key: str, known: Sequence[str]) -> str:
 
 
 def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFrames:
-    """The data set of a config, without unreadable frames where it says so.
-
-    Args:
-        folder: of a run, which keeps a structure that intrinsics are estimated by.
-    """
+    """Build the data set of a config; `folder` keeps a structure that intrinsics are estimated from."""
     given: dict[str, Any] = {}
     if config.dataset.get("intrinsics") == "estimate":
-        from emgs_jax.structure.sequence import calibrate  # what it needs is slow to import
+        from emgs_jax.structure.sequence import calibrate  # slow to import
 
         structure = folder and folder / "structure"
         given["intrinsics"] = partial(calibrate, config=structure_config(config), folder=structure)
@@ -225,21 +214,21 @@ def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFra
     progress = partial(tqdm, desc="checking", unit="frame")
     masks = build(config, "masks", _convert_="all") if "masks" in config else Masks()
     frames = ReadableFrames(dataset, config.on_bad_frame, progress, masks)
-    if "depth_scale" in config.dataset:  # files of depths; None: the data set knows
+    if "depth_scale" in config.dataset:  # None: the data set knows
         scale = config.dataset.depth_scale
         check_truth(frames, None if scale is None else float(scale))
     return frames
 
 
 def structure_config(config: DictConfig) -> "StructureConfig":
-    """How a structure of the images is made: that of the prior, else the default."""
+    """The settings of a structure: the prior's, else the default."""
     has_own = OmegaConf.select(config, "prior.structure") is not None
     own = config if has_own else OmegaConf.merge(compose("prior=multiview_stereo"), {"masks": config.masks})
     return build(own, "prior.structure", _convert_="all")
 
 
 def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
-    """The prior of a config; raises ValueError where it cannot answer for the data set."""
+    """Build the prior of a config; ValueError if it cannot predict for the data set."""
     known = {"classes": list(dataset.classes)} if "classes" in config.prior else {}
     prior = attach_features(config, dataset, build(config, "prior", **known))
     prior.check(dataset, config.slam.window_size)
@@ -247,7 +236,7 @@ def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
 
 
 def baseline_configs(config: DictConfig) -> dict[str, "BaselineConfig"]:
-    """The baselines of a config by name; raises ValueError where an option of the group is none."""
+    """The baselines of a config by name; ValueError for one that is none."""
     for name, node in config.baseline.items():
         if not isinstance(node, DictConfig) or "_target_" not in node:
             raise ValueError(f"baseline.{name} is no baseline: choose baseline=voxel, tsdf, all or none")
@@ -255,7 +244,7 @@ def baseline_configs(config: DictConfig) -> dict[str, "BaselineConfig"]:
 
 
 def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -> Prior:
-    """The prior with the features of a config; without a feature model its own, compared with the text of a file."""
+    """Add the features of a config; without a model the prior's own are compared with the text of a file."""
     features = config.features
     if "_target_" not in features:
         return prior if features.text is None else Requeried(prior, features.text)
@@ -268,7 +257,7 @@ def attach_features(config: DictConfig, dataset: ReadableFrames, prior: Prior) -
 
 
 def message_of(error: Exception) -> str:
-    """Return the message of the original error, without Hydra's wrapping and the number of a system's error."""
+    """The message of the original error, without Hydra's wrapping and a system error's number."""
     cause = error.__cause__ if isinstance(error, InstantiationException) and error.__cause__ else error
     if isinstance(cause, MissingMandatoryValue) and cause.full_key:
         return f"{cause.full_key} is not given: add {cause.full_key}=…"

@@ -1,4 +1,4 @@
-"""Words of the command line for Hydra's grammar: what it cannot read as anything else is text, as it stands."""
+"""Quote words of the command line for Hydra's grammar: what it cannot parse is text."""
 
 import json
 import re
@@ -11,25 +11,23 @@ from hydra.core.override_parser.types import Override, Quote, QuotedString
 from hydra.errors import HydraException
 
 KEY = re.compile(r"(?:\+{1,2}|~)?[A-Za-z_][\w./@:-]*=")
-# Keys whose values are names, though they may look like numbers: in any part of the settings, and by themselves.
+# Keys whose values are names, even if they look like numbers: as the last part of a key, and as the whole key.
 NAMES, WHOLE_NAMES = ("root", "sequence", "folder", "model", "trajectory"), ("map", "out")
-HOME = re.compile(r"(^|[,\[] ?)~(?=/)")  # shells leave it, zsh always, others in quotes
-PLAIN = re.compile(r"[A-Za-z_][\w./-]*|/[\w./-]*")  # text that needs no quotes, but for these words
+HOME = re.compile(r"(^|[,\[] ?)~(?=/)")  # zsh does not expand it, others not in quotes
+PLAIN = re.compile(r"[A-Za-z_][\w./-]*|/[\w./-]*")  # text that needs no quotes, except for WORDS
 WORDS = {"null", "none", "true", "false", "nan", "inf", "on", "off", "yes", "no"}
 
 
 def readable(arguments: Sequence[str]) -> list[str]:
-    """The words with every `key=value` quoted that means something else to Hydra, or nothing.
+    """Quote every value that Hydra would misread: names of existing files or folders, and text beyond its grammar.
 
-    A value is text where there is such a file or folder, and where the grammar has no place for its signs: spaces with
-    brackets, `=`, letters beyond ASCII. A number stays one, unless the key is that of a name: folders are numbered.
-    `~/` is the home.
+    A number stays one, unless its key takes a name (folders may be numbered). `~/` is expanded.
     """
     return [_readable(word) if KEY.match(word) else word for word in arguments]
 
 
 def parsed(word: str) -> Override | None:
-    """Parse a word as Hydra does; None where it is no override."""
+    """Parse a word as Hydra does; None if it is no override."""
     try:
         return OverridesParser.create().parse_override(word)
     except HydraException:
@@ -52,7 +50,6 @@ def _readable(word: str) -> str:
 
 
 def _is_there(value: str) -> bool:
-    """Test whether there is a file or folder of that name."""
     try:
         return value != "" and value == value.strip("\"'") and Path(value).expanduser().exists()
     except (OSError, ValueError):  # too long, or with a zero byte
@@ -60,7 +57,7 @@ def _is_there(value: str) -> bool:
 
 
 def _quoted_items(value: str) -> str:
-    """A list whose items are quoted where Hydra does not read them."""
+    """Quote those items of a list that Hydra cannot read."""
     items = (item.strip() for item in value[1:-1].split(","))
     return f"[{','.join(item if parsed(f'x=[{item}]') is not None else quoted(item) for item in items)}]"
 
@@ -77,5 +74,5 @@ def written(value: Any) -> str:
 
 
 def quoted(value: str) -> str:
-    """Text as Hydra's grammar takes it literally."""
+    """Quote text for Hydra's grammar."""
     return QuotedString(value, Quote.single).with_quotes()

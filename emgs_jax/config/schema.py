@@ -1,7 +1,7 @@
-"""Structured configs: the settings of a class, as its fields declare them, for Hydra.
+"""Structured configs for Hydra, from the fields of classes.
 
-A value that people change stands in conf/, with what it means; one that a class is made for stands at its field. Both
-are keys of a run: `conf/graph/default.yaml` begins with `schema`, which is made here of `BackEndConfig`.
+Values that users change are in conf/; others are defaults of fields. Both are keys of a run: `conf/graph/default.yaml`
+begins with `schema`, which is made here of `BackEndConfig`.
 """
 
 import dataclasses
@@ -58,25 +58,21 @@ def register() -> None:
 
 
 def schema_of(name: str) -> dict[str, Any]:
-    """Return the node of a name in `SCHEMAS`; without keys where its class needs JAX, and JAX is not installed.
-
-    Predictions are recorded where there may be none: nothing of such a class is used there.
-    """
+    """The node of a name in `SCHEMAS`; without keys if its class needs JAX, which recording predictions may lack."""
     if not has_jax() and name not in WITHOUT_JAX:
         return {"_target_": SCHEMAS[name]}
     return node_of(get_class(SCHEMAS[name]))
 
 
 def has_jax() -> bool:
-    """Test whether JAX can be imported."""
     try:
         return importlib.util.find_spec("jax") is not None
-    except ValueError:  # it is kept out of this process
+    except ValueError:  # blocked in this process
         return False
 
 
 def node_of(cls: type, **given: Any) -> dict[str, Any]:
-    """Return the node of a dataclass: its fields with their defaults, `???` where one has none."""
+    """The node of a dataclass: its fields with their defaults, `???` without one."""
     values = {field.name: given.get(field.name, _default(field)) for field in dataclasses.fields(cls)}
     return {"_target_": f"{cls.__module__}.{cls.__qualname__}"} | values
 
@@ -92,7 +88,7 @@ def _default(field: dataclasses.Field) -> Any:
 
 
 def _plain(value: Any) -> Any:
-    """A value as YAML holds it."""
+    """Convert a value for YAML."""
     if isinstance(value, Mapping):
         return {key: _plain(item) for key, item in value.items()}
     return [*value] if isinstance(value, tuple) else value

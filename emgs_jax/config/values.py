@@ -1,7 +1,6 @@
-"""The values of a config before anything is made of them: each is of the kind and in the range that its field declares.
+"""Check the values of a config against the declarations of fields or parameters.
 
-A field declares its range where it stands (`ops.ranges`, `traced`, `static`, `choice`); what kind it is its annotation
-says, as for the parameters of a class that is no dataclass.
+The type is the annotation; a field declares its range or choices (`ops.ranges`, `traced`, `static`, `choice`).
 """
 
 import dataclasses
@@ -23,7 +22,7 @@ _NAMES = {bool: "true or false", str: "text", types.NoneType: "null"}
 
 
 class Declared(NamedTuple):
-    """What a field allows: the type that it is annotated with, its range, its names."""
+    """What a field allows: its annotation, range and choices."""
 
     hint: Any
     range: Range | None = None
@@ -31,19 +30,19 @@ class Declared(NamedTuple):
 
     @property
     def kinds(self) -> set[type]:
-        """Plain kinds that a value may have; none where anything goes."""
+        """Plain types that a value may have; none if any value may."""
         return {part for part in _parts(self.hint) if part in (int, float, *_NAMES)}
 
 
 def check_keys(config: DictConfig, cls: type) -> None:
-    """Raise ValueError with the key where a value of a config is not what the field of a class declares."""
+    """Raise ValueError if a value of a config is not what a class declares."""
     for key, field in declared(cls).items():
         if not OmegaConf.is_missing(config, key):
             check_value(key, config[key], field)
 
 
 def check_values(config: DictConfig, key: str) -> None:
-    """Raise ValueError with the full key where a value at or below a node with `_target_` is not what is declared."""
+    """Raise ValueError, with the full key, if a value at or below a node is not what its `_target_` declares."""
     node = OmegaConf.select(config, key)
     if not isinstance(node, DictConfig):
         return
@@ -51,7 +50,7 @@ def check_values(config: DictConfig, key: str) -> None:
     for name in node:
         own = f"{key}.{name}"
         if found := re.fullmatch(r"\$\{(\w[\w.]*)\}", str(OmegaConf.to_container(node, resolve=False)[name])):
-            own = found[1]  # where the value stands that is only referred to
+            own = found[1]  # the key that is referred to
         value = MISSING if OmegaConf.is_missing(node, name) else node[name]
         if isinstance(value, DictConfig) and (name not in fields or not _is_plain(fields[name])):
             check_values(config, own)
@@ -60,7 +59,7 @@ def check_values(config: DictConfig, key: str) -> None:
 
 
 def check_value(key: str, value: Any, field: Declared) -> None:
-    """Raise ValueError where the value of `key` is not what its field declares."""
+    """Raise ValueError if the value of `key` is not what its field declares."""
     value = OmegaConf.to_container(value) if OmegaConf.is_config(value) else value
     shown = "null" if value is None else repr(value)
     if isinstance(value, str) and value.lstrip("+-").lower() == ".inf":
@@ -77,14 +76,14 @@ def check_value(key: str, value: Any, field: Declared) -> None:
 
 
 def declared(cls: type) -> dict[str, Declared]:
-    """Return the declarations of the fields of a dataclass, or of the parameters of another class, by name."""
+    """The declarations of a dataclass's fields, or of another class's parameters."""
     if not dataclasses.is_dataclass(cls):
         return {name: Declared(found.annotation) for name, found in inspect.signature(cls).parameters.items()}
     return {field.name: _of_field(field) for field in dataclasses.fields(cls)}
 
 
 def field_of(config: DictConfig, key: str) -> Declared:
-    """Return the declaration of the field at a dotted key of a composed config; its parent has a `_target_`."""
+    """The declaration of the field at a dotted key of a composed config."""
     parent, _, name = key.rpartition(".")
     return declared(get_class(OmegaConf.select(config, parent)["_target_"]))[name]
 
@@ -92,11 +91,11 @@ def field_of(config: DictConfig, key: str) -> Declared:
 def _of_field(field: dataclasses.Field) -> Declared:
     found = Declared(field.type, field.metadata.get("range"), tuple(field.metadata.get("choices", ())))
     is_array = found.range is not None and not found.kinds and not _is_list(field.type)
-    return found._replace(hint=float) if is_array else found  # a traced one is annotated as the array that it becomes
+    return found._replace(hint=float) if is_array else found  # a traced field is annotated as an array
 
 
 def _fits(value: Any, hint: Any, ends: Range | None) -> bool:
-    """Test whether a value is of the kind of a hint, and in the range; of a hint that is not of YAML any value is."""
+    """Test whether a value has a hint's type and is in the range; any value fits a hint beyond YAML."""
     parts = _parts(hint)
     if len(parts) > 1:
         return any(_fits(value, part, ends) for part in parts)
@@ -111,7 +110,7 @@ def _fits(value: Any, hint: Any, ends: Range | None) -> bool:
         items = [part for part in typing.get_args(hint) if part is not ...]
         is_open = typing.get_origin(hint) is not tuple or ... in typing.get_args(hint)
         if value is None:
-            return items == [str]  # names of classes, which are filled in
+            return items == [str]  # names of classes, filled in later
         if not isinstance(value, list | tuple) or not (is_open or len(value) == len(items)):
             return False
         return all(_fits(item, items[0] if is_open else items[n], ends) for n, item in enumerate(value))
@@ -119,7 +118,7 @@ def _fits(value: Any, hint: Any, ends: Range | None) -> bool:
 
 
 def _words(field: Declared) -> list[str]:
-    """Words for each kind that would be right."""
+    """Describe each type that would be right."""
     low, high = ("", "") if field.range is None else map(_end, field.range)
     ends = f" from {low} to {high}" if low else ""
     kinds = field.kinds
@@ -146,5 +145,5 @@ def _is_list(hint: Any) -> bool:
 
 
 def _parts(hint: Any) -> tuple[Any, ...]:
-    """The alternatives of a union; of any other hint itself."""
+    """The alternatives of a union, or the hint itself."""
     return typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else (hint,)

@@ -78,7 +78,6 @@ def lane_ahead(plan: Plan, camera: Float[np.ndarray, "n 2"]) -> Lane:
 
 
 def doorways(plan: Plan) -> list[tuple[int, Point]]:
-    """Wall and middle of every doorway."""
     middle = HALF_HALL + WALL
     found = [(EAST, plan.north_door), (EAST, plan.south_door)]
     found += [(NORTH, (x, y)) for x in (plan.west, plan.east) for y in (middle, -middle)]

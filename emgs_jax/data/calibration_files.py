@@ -97,7 +97,6 @@ _Loader.add_constructor(
 
 
 def parse_keys(text: str, path: Path) -> dict[str, Any]:
-    """Parse a JSON or YAML file of keys and values."""
     try:
         if path.suffix.lower() == ".json":
             values = json.loads(text)

@@ -70,7 +70,6 @@ def as_number(value: Any, key: str, where: object) -> float:
 
 
 def size_of(width: float, height: float, where: object) -> Size:
-    """(width, height) in whole pixels."""
     if min(width, height) < 1 or width != int(width) or height != int(height):
         raise ValueError(f"{where}: width and height must be pixels, got {width:g} and {height:g}: correct them")
     return int(width), int(height)

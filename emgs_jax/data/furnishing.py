@@ -47,7 +47,6 @@ def at_wall(parts: list[Part], area: Area, wall: int, share: float) -> list[Part
 
 
 def bounds(parts: list[Part]) -> Bounds:
-    """Bounding box of all parts."""
     each = np.array([mesh.bounds for _, mesh in parts])
     return np.stack([each[:, 0].min(axis=0), each[:, 1].max(axis=0)])
 
@@ -59,7 +58,6 @@ def _with_back(parts: list[Part]) -> list[Part]:
 
 
 def _doorsteps(area: Area) -> list[Bounds]:
-    """Boxes before the doorways."""
     boxes = []
     for wall, middle in area.doors:
         across = (area.high if wall in (EAST, NORTH) else area.low)[wall % 2]

@@ -43,7 +43,6 @@ def against(parts: list[Part], wall: int, size: Float[np.ndarray, " 3"], along: 
 
 
 def table_with_chairs(rng: np.random.Generator) -> list[Part]:
-    """Table with things on it and chairs around it."""
     w, d = rng.uniform(0.95, 1.2), rng.uniform(0.55, 0.7)
     parts = table(w, d, 0.74)
     parts += moved(join("box", box((0.24, 0.16, 0.2), (0, 0, 0))), np.array([-w / 4, 0.05, 0.74]), rng.uniform(0, 3))
@@ -75,7 +74,6 @@ def sofa(rng: np.random.Generator) -> list[Part]:
 
 
 def shelf(rng: np.random.Generator) -> list[Part]:
-    """Open shelf with boxes on its boards."""
     w, h = rng.uniform(1.0, 1.3), rng.uniform(1.7, 1.95)
     boards = [box((w, 0.32, 0.03), (0, 0.16, z)) for z in np.linspace(0.06, h - 0.03, 5)]
     sides = [box((0.03, 0.32, h), (s * w / 2, 0.16, 0)) for s in (-1, 1)]
@@ -117,7 +115,6 @@ def boxes(rng: np.random.Generator) -> list[Part]:
 
 
 def low_table(rng: np.random.Generator) -> list[Part]:
-    """Low table with a box and a ball on it."""
     w, d = rng.uniform(0.9, 1.2), rng.uniform(0.5, 0.7)
     parts = table(w, d, 0.45)
     parts += moved(join("box", box((0.3, 0.22, 0.1), (0, 0, 0))), np.array([-w / 4, 0.0, 0.45]), rng.uniform(0, 3))
@@ -125,7 +122,6 @@ def low_table(rng: np.random.Generator) -> list[Part]:
 
 
 def bed(rng: np.random.Generator) -> list[Part]:
-    """Bed whose head is at the wall, with a cushion."""
     w, length = rng.uniform(1.2, 1.5), rng.uniform(1.95, 2.1)
     head, foot = box((w, 0.06, 0.9), (0, 0.03, 0)), box((w, 0.06, 0.5), (0, length - 0.03, 0))
     mattress = box((w - 0.04, length - 0.12, 0.3), (0, length / 2, 0.18))
@@ -133,7 +129,6 @@ def bed(rng: np.random.Generator) -> list[Part]:
 
 
 def plant(rng: np.random.Generator) -> list[Part]:
-    """Pot with a stem and a crown of balls."""
     h, r = rng.uniform(0.8, 1.1), rng.uniform(0.14, 0.17)
     crown = [trimesh.creation.icosphere(subdivisions=3, radius=r) for _ in range(5)]
     for turn, leaf in enumerate(crown):
@@ -147,7 +142,6 @@ def ceiling_lamp(at: tuple[float, float], ceiling: float) -> list[Part]:
 
 
 def closed_door(width: float, height: float) -> list[Part]:
-    """Door that nobody opens, in its frame."""
     rails = [box((0.09, 0.05, height), (s * (width / 2 + 0.045), 0.025, 0)) for s in (-1, 1)]
     lintel = box((width + 0.18, 0.05, 0.09), (0, 0.025, height))
     panels = [box((width - 0.3, 0.04, height / 2 - 0.3), (0, 0.02, z)) for z in (0.15, height / 2 + 0.1)]

@@ -59,7 +59,6 @@ class Images(Straightened):
         return time, name if self._video is None else f"{name}, frame {self._chosen[index]}"
 
     def _shown(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        """An image of any size."""
         if self._video is not None:
             return self._video.read(self._chosen[index])
         return read_shown(self._images[index], None, self._tones)

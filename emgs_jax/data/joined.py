@@ -50,7 +50,6 @@ class JoinedFrames(Dataset):
 
 
 def joined_name(names: Iterable[object]) -> str:
-    """The distinct names, joined."""
     return "+".join(dict.fromkeys(map(str, names)))
 
 

@@ -63,7 +63,6 @@ def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
 
 
 def read_rows(path: Path, count: int) -> list[str]:
-    """Read a list with a line for every image."""
     rows = reading.layout_text(path, f"{LAYOUT} ({SOURCE})").rstrip().splitlines()
     if len(rows) != count:
         raise ValueError(f"{path} has {len(rows)} lines for {count} images: fetch the sequence and this file again")

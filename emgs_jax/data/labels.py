@@ -39,7 +39,6 @@ class LabelFolder:
         self._largest_id = max(self._known.positions or ())
 
     def path(self, image: str | Path) -> Path:
-        """The class image of an image."""
         return self.folder / f"{Path(image).stem}.png"
 
     def read(self, image: str | Path, raw_size: tuple[int, int] | None = None) -> Int32[np.ndarray, "h w"]:

@@ -82,7 +82,6 @@ def _person(lane: Lane, number: int, rng: np.random.Generator) -> Mover:
 
 
 def _chair(lane: Lane, number: int, rng: np.random.Generator) -> Mover:
-    """A chair that moves after the first half of the path."""
     distance, yaw = lane.chair + 0.9 * number, rng.uniform(0, 2 * np.pi)
     before, after = lane.at(np.array([distance, distance + CHAIR_SHIFT]), -ASIDE)
     is_moved = np.arange(len(lane.walked)) >= len(lane.walked) / 2

@@ -65,7 +65,6 @@ class Plan:
 
 
 def draw_plan(rng: np.random.Generator) -> Plan:
-    """Draw the sizes of the rooms and their doorways."""
     near = HALF_HALL + 2 * WALL  # |y| at which rooms begin
     (living_w, dining_w, study_w, bedroom_w, twin_w), (living_d, dining_d, study_d, bedroom_d, twin_d) = rng.uniform(
         ((5.6, 5.2, 4.4, 5.3, 5.0), (4.4, 4.8, 3.6, 4.0, 4.5)), ((6.0, 5.6, 4.9, 5.7, 5.4), (4.7, 5.1, 3.9, 4.3, 4.8))

@@ -36,7 +36,6 @@ def oddities(intrinsics: Intrinsics, size: Size) -> list[str]:
 
 
 def is_impossible(intrinsics: Intrinsics, size: Size) -> bool:
-    """Test whether no lens has such an angle of view."""
     views = view_deg(intrinsics, size)
     return not (min(views) >= NARROWEST_VIEW_DEG and max(views) <= USUAL_VIEW_DEG[1])
 

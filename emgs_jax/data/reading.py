@@ -75,7 +75,6 @@ def check_index(index: int, count: int) -> None:
 
 
 def check_size(size: Sequence[int]) -> Size:
-    """Check that `size` is two positive integers."""
     values = tuple(size) if isinstance(size, Iterable) else (size,)
     if len(values) != 2 or not all(isinstance(value, int) and 1 <= value <= MAX_SIDE for value in values):
         raise ValueError(f"dataset.size must be [width, height] in pixels, up to {MAX_SIDE}, got {size}")
@@ -117,7 +116,6 @@ def resize_intrinsics(intrinsics: Intrinsics, raw_size: Size, size: Size) -> Int
 
 
 def resize_color(image: UInt8[np.ndarray, "_ _ 3"], size: Size) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Resize by averaging."""
     return cv2.resize(image, size, interpolation=cv2.INTER_AREA)
 
 

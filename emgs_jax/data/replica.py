@@ -67,7 +67,6 @@ def find_images(folder: Path) -> list[Path]:
 
 
 def number_of(path: Path) -> int:
-    """12 for frame000012.jpg."""
     return int(path.stem[len("frame") :])
 
 

@@ -187,7 +187,6 @@ def _topic_of(bag: Any, kinds: Sequence[str], topic: str | None, path: Path, key
 
 
 def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Calibration:
-    """The camera of the first CameraInfo."""
     kinds = {connection.topic for connection in bag.connections if connection.msgtype == INFO}
     beside = f"{topic.removesuffix('/compressed').rsplit('/', 1)[0]}/camera_info"
     if not kinds:

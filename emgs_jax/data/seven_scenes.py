@@ -135,7 +135,6 @@ def find_images(folder: Path) -> list[Path]:
 
 
 def frame_number(path: Path) -> float:
-    """12 for frame-000012.color.png."""
     return float(path.name.split(".")[0][len("frame-") :])
 
 

@@ -39,5 +39,4 @@ class Spool:
 
 
 def _bytes(array: np.ndarray) -> np.ndarray:
-    """The memory of a contiguous array."""
     return array.reshape(-1).view(np.uint8)

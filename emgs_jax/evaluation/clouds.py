@@ -100,7 +100,6 @@ class VoxelMeans:
         return sum(self.sizes)
 
     def tables(self) -> Iterator[np.ndarray]:
-        """The rows of each part."""
         return (self.parts[part] for part in range(len(self.sizes)))
 
     def __iter__(self) -> Iterator[PointCloud]:
@@ -117,7 +116,6 @@ class VoxelMeans:
         return np.concatenate([np.empty((0, self.width), np.float32), *found])
 
     def cloud(self) -> PointCloud:
-        """All means."""
         return _cloud(np.concatenate([np.empty((0, 10), np.float32), *self.tables()]))
 
     def counts(self) -> np.ndarray:

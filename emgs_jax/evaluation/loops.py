@@ -52,7 +52,6 @@ def _is_right(measured: np.ndarray, true_a: np.ndarray, true_b: np.ndarray) -> b
 
 
 def _returning(truth: Sequence[np.ndarray | None], min_gap: int) -> list[int]:
-    """Frames that return to a place."""
     rows, found = [row for row, pose in enumerate(truth) if pose is not None], []
     poses = np.array([truth[row] for row in rows])
     for row in rows:

@@ -36,7 +36,6 @@ def require(folder: str, names: Sequence[str], source: str) -> list[Path]:
 
 
 def digest(path: Path) -> str:
-    """The SHA-256 of a file."""
     with open(path, "rb") as handle:
         return hashlib.file_digest(handle, "sha256").hexdigest()
 

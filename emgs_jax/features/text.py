@@ -27,11 +27,9 @@ class TextEmbeddings:
     model: dict
 
     def missing(self, names: Sequence[str]) -> list[str]:
-        """Those of `names` that have no vector."""
         return [name for name in names if name not in self.names]
 
     def only(self, names: Sequence[str]) -> "TextEmbeddings":
-        """The embeddings of `names`, in that order."""
         return replace(self, names=tuple(names), vectors=self.vectors[[self.names.index(name) for name in names]])
 
 
@@ -60,7 +58,6 @@ def _unit(vectors: np.ndarray) -> np.ndarray:
 
 
 def save_text(path: Path | str, text: TextEmbeddings) -> None:
-    """Write the embeddings atomically."""
     about = {"names": text.names, "templates": text.templates, "model": text.model}
     vectors = {"embeddings": np.asarray(text.vectors, np.float32)}
     save_headed(path, {"format": FORMAT, "version": VERSION, **about}, vectors, "header")

@@ -33,7 +33,6 @@ def atomic_write(path: str | os.PathLike, mode: str = "wb") -> Iterator[IO]:
 
 
 def write_file(path: str | os.PathLike, content: str | bytes) -> None:
-    """Write a file atomically."""
     with atomic_write(path, "w" if isinstance(content, str) else "wb") as handle:
         handle.write(content)
 

@@ -48,7 +48,6 @@ def read_vertices(path: str | os.PathLike) -> dict[str, np.ndarray]:
 
 
 def num_faces(path: str | os.PathLike) -> int:
-    """The number of faces in a PLY's header."""
     with Path(path).open("rb") as file:
         _, elements, _ = _header(file.read(_MAX_HEADER_BYTES + len("\r\n")), path)
     return sum(element.count for element in elements if element.name == "face")
@@ -109,7 +108,6 @@ def _is_type(words: list[str]) -> bool:
 
 
 def _row_type(element: Element, order: str) -> np.dtype:
-    """The type of one row of an element without lists."""
     return np.dtype([(name, order + str(kind)) for name, kind in element.properties.items()])
 
 

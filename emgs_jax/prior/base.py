@@ -181,7 +181,6 @@ def no_points(size: Sequence[int]) -> DenseView:
 def predicted(
     window: Window, T_anchor_view: np.ndarray, dense: Sequence[DenseView], features: np.ndarray | None = None, **known
 ) -> PriorPrediction:
-    """Stack dense views into a prediction."""
     points, confidence, mask = (np.stack(parts) for parts in zip(*dense, strict=True))
     features = np.zeros((*mask.shape, 0), np.float16) if features is None else features
     return PriorPrediction(window, T_anchor_view, points, confidence, mask, features, **known)

@@ -140,7 +140,6 @@ def record(
 
 
 def visits_file(window: Window) -> str:
-    """The file name of an inference with two visits."""
     return f"visits_{'_'.join(f'{view:06d}' for view in window.views)}.npz"
 
 
@@ -234,7 +233,6 @@ class Recorded(Prior):
         return PriorPrediction(window, *(arrays[key] for key in FIELDS), covariance, scale_std, world)
 
     def _load(self, name: str, keys: Sequence[str], optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
-        """Read and verify one file of the recording."""
         path = self.folder / name
         if not path.is_file():
             raise ValueError(f"{path} is missing: {COMPLETE}")
@@ -273,7 +271,6 @@ def _resume(folder: Path, header: dict) -> dict[str, str]:
 
 
 def _read_manifest(folder: Path) -> dict:
-    """Read and check the manifest."""
     path = folder / "manifest.json"
     if not path.is_file():
         raise ValueError(f"{path} is missing: expected the folder of a recording (manifest.json, 000000.npz, …)")

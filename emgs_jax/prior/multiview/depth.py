@@ -58,11 +58,7 @@ def _median(depth: Float[Array, "h w"], radius: int) -> Float[Array, "h w"]:
 
 @full_precision
 def estimate_depth(
-    gray: Float[Array, "h w"],
-    sources: Sources,
-    depth_range: Float[Array, "2"],
-    camera: Camera,
-    config: DepthConfig,
+    gray: Float[Array, "h w"], sources: Sources, depth_range: Float[Array, "2"], camera: Camera, config: DepthConfig
 ) -> tuple[Float[Array, "h w"], Float[Array, "h w"]]:
     """Depth z (m) of every pixel, 0 where no plane stands out or the best is the first or last; and its spread.
 

@@ -66,7 +66,6 @@ def way_of_files(config: DepthFilesConfig) -> Way:
 
 
 def open_depths(folder: Path, kind: str, depth_scale: float) -> DepthFiles:
-    """Find the depths in a folder, or in one file."""
     in_folder = (found for suffix in SUFFIXES if (found := files_of(folder, suffix)))
     paths = [folder] if folder.is_file() else next(in_folder, [])
     if not paths or paths[0].suffix not in SUFFIXES:

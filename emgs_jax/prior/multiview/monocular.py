@@ -65,7 +65,6 @@ def begin_monocular(
 
 
 def _depths(found: Structure, world: int) -> np.ndarray:
-    """Depths of all landmarks of a world in all of its frames."""
     z = np.concatenate([found.depths(frame) for frame in np.flatnonzero(found.world == world)])
     return z[z > 0]
 

@@ -42,7 +42,6 @@ AnyDense = SweptConfig | LearnedConfig | DepthFilesConfig | MeterConfig
 
 
 def way_of(config: AnyDense) -> Way:
-    """The method that a config belongs to."""
     if isinstance(config, DepthFilesConfig):
         return way_of_files(config)
     if isinstance(config, MeterConfig):
@@ -125,7 +124,6 @@ class MultiviewStereo(Prior):
         return self.predict(window, frames, intrinsics) if is_known else None
 
     def _prepare(self) -> None:
-        """Make the structure, once."""
         if self._found is not None:
             return
         if self._dataset is None:

@@ -73,7 +73,6 @@ class MapAnything(Prior):
         self.provenance = Provenance("mapanything", self._settings(compute) | self._network.described)
 
     def _settings(self, compute: ComputeConfig) -> dict[str, Any]:
-        """The settings in effect, for the provenance."""
         return {
             "version": 2,
             "anchor_pose": self._anchor_is_metric is not None,

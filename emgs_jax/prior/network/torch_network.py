@@ -81,7 +81,6 @@ def offline(torch: ModuleType) -> Iterator[None]:
 
 
 def _cached_clone(repository: str, hub: Path) -> Path:
-    """torch.hub's copy of a repository `owner/name[:reference]`."""
     name, _, reference = repository.partition(":")
     branches = [reference] if reference else ["main", "master"]
     clones = [hub / f"{name.replace('/', '_')}_{branch}" for branch in branches]

@@ -71,5 +71,4 @@ def read_layers(part: Tensors, told: Mapping[str, Mapping[str, Any]]) -> Layers:
 
 
 def layers(network: Mapping[str, Any], prefix: str, names: Iterable[object]) -> list[Conv]:
-    """The layers PREFIX.NAME."""
     return [network[f"{prefix}.{name}"] for name in names]

@@ -31,7 +31,6 @@ class Stream(IntEnum):
 
 
 def normals(shape: tuple[int, ...], key: tuple[int, ...]) -> np.ndarray:
-    """Standard normal float32 numbers."""
     return np.random.default_rng(key).standard_normal(shape, np.float32)
 
 

@@ -122,7 +122,6 @@ class Simulated(Prior):
             )
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Disturb the truth of `frames`."""
         return self._answer(window, frames, intrinsics, window.inference)
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
@@ -182,7 +181,6 @@ class Simulated(Prior):
         return T_left_right @ rigid(xi, self.level * noise.pair_translation, self.level * noise.pair_rotation)
 
     def _geometry(self, inference: int, frame: Frame, intrinsics: Sequence[float], scale: float) -> DenseView:
-        """Points, confidence and mask of one view."""
         depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0), frame.depth, 0).astype(np.float32)
         mask = depth > 0
         flown, near_edge = self._flying(inference, frame.index, depth)
