@@ -8,8 +8,6 @@ from emgs_jax.ops.ranges import number, one_of
 
 @dataclass(frozen=True)
 class EvaluateKeys:
-    """`conf/evaluate.yaml`."""
-
     overrides: Sequence[str]
     shard: str
     seeds: tuple[int, ...] = number(low=0)
@@ -17,16 +15,12 @@ class EvaluateKeys:
 
 @dataclass(frozen=True)
 class EmbedKeys:
-    """`conf/embed.yaml`."""
-
     classes: Sequence[str]
     out: str
 
 
 @dataclass(frozen=True)
 class SegmentKeys:
-    """`conf/segment.yaml`."""
-
     map: str | Sequence[str]
     ignored: Sequence[str]
     with_scale: bool
@@ -40,8 +34,6 @@ class SegmentKeys:
 
 @dataclass(frozen=True)
 class QueryKeys:
-    """`conf/query.yaml`."""
-
     margin: float = number(low=0, high=2)
     min_cosine: float = number(low=-1, high=1)
     num_views: int = number(low=1, high=100)
@@ -51,8 +43,6 @@ class QueryKeys:
 
 @dataclass(frozen=True)
 class ScoreKeys:
-    """`conf/score.yaml`."""
-
     max_time_difference: float = number(low=0)
     min_associated_percent: float = number(low=0, high=100)
     min_matched_percent: float = number(low=0, high=100)
@@ -61,8 +51,6 @@ class ScoreKeys:
 
 @dataclass(frozen=True)
 class ViewKeys:
-    """`conf/view.yaml`."""
-
     folder: str
     port: int = number(low=1, high=65535)
 

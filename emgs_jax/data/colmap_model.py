@@ -1,7 +1,7 @@
-"""COLMAP's sparse model as it is read, from text or binary: cameras, and images with their poses.
+"""Read COLMAP's sparse model, text or binary: cameras, and images with their poses.
 
-Its poses are world → camera; ours are camera → world. pycolmap does not read them here: a damaged binary file makes it
-hang or ask for gigabytes, it names no line, and it wants all points.
+Its poses are world → camera; ours are camera → world. pycolmap is not used: damaged binary files make it hang or
+allocate gigabytes, it names no line, and needs all points.
 """
 
 import struct
@@ -33,13 +33,13 @@ class SparseModel:
 
 
 class _Records:
-    """A binary file, read from its beginning; what ends before it should is a ValueError that names it."""
+    """A binary file, read from its beginning; ValueError, which names it, if it ends too soon."""
 
     def __init__(self, path: Path) -> None:
         self._path, self._data, self._place = path, reading.read_bytes(path), 0
 
     def __iter__(self) -> Iterator[Self]:
-        """Itself, once for each record that it announces; then it must end."""
+        """Yield itself for each announced record; then the file must end."""
         for _ in range(*self.values("Q")):
             yield self
         if self._place < len(self._data):
@@ -51,7 +51,7 @@ class _Records:
         return struct.unpack(f"<{layout}", self.skip(size))
 
     def text(self) -> str:
-        """As far as the next zero byte."""
+        """The text up to the next zero byte."""
         return self.skip(self._data.find(b"\0", self._place) + 1 - self._place)[:-1].decode("utf-8", "replace")
 
     def skip(self, size: int) -> bytes:
@@ -66,10 +66,10 @@ def is_model(folder: Path) -> bool:
 
 
 def load_colmap(folder: Path) -> SparseModel:
-    """Read the cameras and images of a model, from binary files where they are there, as COLMAP does, else from text.
+    """Read the cameras and images of a model, from binary files if they exist, as COLMAP does, else from text.
 
     Raises:
-        ValueError: a line or a record is damaged, or there is no image with a pose, or one of no camera or twice.
+        ValueError: a line or a record is damaged, no image has a pose, or an image has no camera or exists twice.
     """
     is_binary = all((folder / name).is_file() for name in BINARY)
     cameras_file, images_file = (folder / name for name in (BINARY if is_binary else TEXT))
@@ -85,7 +85,7 @@ def load_colmap(folder: Path) -> SparseModel:
 
 
 def load_cameras(path: Path) -> dict[int, Calibration]:
-    """The cameras of cameras.txt or cameras.bin by id."""
+    """Read the cameras of cameras.txt or cameras.bin, by id."""
     return (_binary_cameras if path.suffix.lower() == ".bin" else _text_cameras)(path)
 
 
@@ -115,7 +115,7 @@ def _text_cameras(path: Path) -> dict[int, Calibration]:
 
 
 def _binary_images(path: Path) -> list[Image]:
-    """The layout is in COLMAP's documentation of its output format."""
+    """Read images.bin; COLMAP documents its layout."""
     images = []
     for record in _Records(path):
         number, *values, camera = record.values("I7dI")
@@ -151,7 +151,7 @@ def _text_images(path: Path) -> list[Image]:
 
 
 def _pose(values: Sequence[float], place: str) -> np.ndarray:
-    """World → camera (4, 4) of QW QX QY QZ TX TY TZ."""
+    """World → camera (4, 4) from QW QX QY QZ TX TY TZ."""
     w, x, y, z, *position = values
     try:
         return reading.rigid(position, (x, y, z, w))
@@ -160,7 +160,7 @@ def _pose(values: Sequence[float], place: str) -> np.ndarray:
 
 
 def check_whole(folder: Path) -> None:
-    """Check that the binary files of a model do not end too soon, which is a ValueError: pycolmap would not end."""
+    """Raise ValueError if binary files of a model end too soon: pycolmap would hang."""
     for path in sorted(folder.glob("*.bin")):
         if path.stem in _CHECKED:
             _CHECKED[path.stem](path)

@@ -1,4 +1,4 @@
-"""Intrinsics by `dataset.intrinsics` (numbers, a calibration file, exif, estimate), and undistortion of the images."""
+"""Find intrinsics by `dataset.intrinsics` (numbers, a calibration file, exif, estimate), and undistort images."""
 
 import math
 import struct
@@ -21,8 +21,8 @@ from emgs_jax.data.reading import Intrinsics, Number, Size
 from emgs_jax.data.tones import Tones, read_shown
 from emgs_jax.data.undistortion import Maps, undistortion
 
-DIAGONAL_35_MM = 43.27  # of 36 mm x 24 mm; cameras scale by the diagonal, whatever their aspect (COLMAP's rule)
-MAX_ASPECT_CHANGE = 0.02  # between the picture that the camera took and the file
+DIAGONAL_35_MM = 43.27  # of 36 mm x 24 mm, by which cameras scale at any aspect (COLMAP's rule)
+MAX_ASPECT_CHANGE = 0.02  # from the picture that the camera took to the file
 ALTERNATIVES = (
     "dataset.intrinsics=[fx,fy,cx,cy] in pixels of the images on disk (then k1,k2,p1,p2 and maybe k3 of the lens; or "
     "[MODEL,…] with COLMAP's parameters), a calibration file, exif or estimate"
@@ -35,10 +35,10 @@ class Pictures:
 
     size: Size  # (width, height) on disk
     count: int
-    read: Callable[[int], UInt8[np.ndarray, "_ _ 3"]]  # RGB image 0..count-1 as it is on disk; raises BadFrameError
-    files: Sequence[Path] = ()  # their files; empty for a video
-    name: str = "images"  # of them all, for messages
-    numbers: Sequence[int] = ()  # of the frames of a video
+    read: Callable[[int], UInt8[np.ndarray, "_ _ 3"]]  # RGB image 0..count-1 as on disk; raises BadFrameError
+    files: Sequence[Path] = ()  # empty for a video
+    name: str = "images"  # for messages
+    numbers: Sequence[int] = ()  # of a video's frames
 
 
 Estimator = Callable[[Pictures], tuple[Calibration, dict[str, Any]]]
@@ -47,18 +47,18 @@ Given = str | Sequence[Number | str] | Estimator  # dataset.intrinsics; a functi
 
 @dataclass(frozen=True)
 class Lens:
-    """Undistortion of images: they become those of a pinhole camera."""
+    """Undistortion to a pinhole camera."""
 
-    intrinsics: Intrinsics  # fx, fy, cx, cy of the straight images, which have the size of those on disk
-    maps: Maps | None  # tables of cv2.remap; None where the images are straight
-    about: Mapping[str, Any]  # where the intrinsics come from, plain values for metrics.json
+    intrinsics: Intrinsics  # fx, fy, cx, cy of the undistorted images, which have the size of those on disk
+    maps: Maps | None  # tables of cv2.remap; None without distortion
+    about: Mapping[str, Any]  # origin of the intrinsics for metrics.json
 
     def straighten(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
-        """The image without distortion, interpolated."""
+        """Undistort an image, bilinearly."""
         return image if self.maps is None else cv2.remap(image, *self.maps, cv2.INTER_LINEAR)
 
     def straighten_depth(self, depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
-        """Depth that is registered to the distorted image, without distortion; nearest, as depths must not be mixed."""
+        """Undistort depth that is registered to the image, by the nearest, as depths must not be mixed."""
         return depth if self.maps is None else cv2.remap(depth, *self.maps, cv2.INTER_NEAREST)
 
 
@@ -68,11 +68,10 @@ def pictures_of(files: Sequence[Path], size: Size, tones: Tones | None = None) -
 
 
 def find_lens(given: Given, pictures: Pictures) -> Lens:
-    """The camera that `dataset.intrinsics` names.
+    """The lens that `dataset.intrinsics` names.
 
     Raises:
-        ValueError: numbers, file, EXIF or images do not tell a camera, or one of another size; or the distortion leaves
-            nothing of the image.
+        ValueError: numbers, file, EXIF or images give no camera, or one of another size, or too much distortion.
         FileNotFoundError: no such calibration file.
     """
     about: dict[str, Any] = {"source": "numbers"}
@@ -98,17 +97,12 @@ def find_lens(given: Given, pictures: Pictures) -> Lens:
 
 
 def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any], images: str = "images") -> Lens:
-    """The lens of a calibration.
+    """The lens of a calibration for images of `size` on disk; `what` and `images` name both in errors.
 
-    Args:
-        size: (width, height) of the images on disk.
-        what: names the calibration in errors.
-        about: where it comes from; size, intrinsics and distortion are added.
-        images: names them, likewise.
+    Size, intrinsics and distortion are added to `about`.
 
     Raises:
-        ValueError: it is for images of another size, no lens has such a view, or the distortion leaves nothing of the
-            image.
+        ValueError: it is for another size, no lens has such a view, or the distortion leaves nothing of the image.
     """
     check_image_size(camera, size, what)
     raw = reading.check_intrinsics(camera.intrinsics, size, what, images)
@@ -125,13 +119,13 @@ def to_lens(camera: Calibration, size: Size, what: str, about: Mapping[str, Any]
 
 
 def with_notes(about: Mapping[str, Any], *notes: str | None) -> Mapping[str, Any]:
-    """The description of a lens whose `note` also says what `notes` say of the images."""
+    """Add notes on the images to the `note` of a lens's description."""
     said = [note for note in (about.get("note"), *notes) if note]
     return {**about, "note": "; ".join(said)} if said else about
 
 
 def from_numbers(given: Sequence[Number | str]) -> Calibration:
-    """fx, fy, cx, cy, and OpenCV's distortion where there is any; or the name of COLMAP's model and its parameters."""
+    """The camera of fx, fy, cx, cy, maybe with OpenCV's distortion; or of a COLMAP model's name and parameters."""
     what = "dataset.intrinsics"
     values = [*given] if isinstance(given, Iterable) else [given]
     if values and isinstance(values[0], str):
@@ -145,17 +139,14 @@ def from_numbers(given: Sequence[Number | str]) -> Calibration:
 
 
 def from_exif(pictures: Pictures) -> Calibration:
-    """The focal length that the camera wrote into every image as that of 35 mm film, with the centre in the middle.
-
-    The diagonal, and so the focal length in pixels, is the same however the orientation tag turns the image.
-    """
+    """A centred camera with the 35 mm equivalent focal length of all images; the orientation tag does not matter."""
     if not pictures.files:
         raise ValueError(f"dataset.intrinsics=exif needs image files, a video has no EXIF: give {ALTERNATIVES}")
     found: dict[float | None, Path] = {}
     for path in pictures.files:
         try:
             found.setdefault(exif_focal_length(path, pictures.size), path)
-        except (OSError, SyntaxError, struct.error):  # Pillow's for a damaged image, whose turn comes when it is read
+        except (OSError, SyntaxError, struct.error):  # a damaged image, which is reported when it is read
             continue
     if not found or None in found:
         path = found.get(None, pictures.files[0])
@@ -173,7 +164,7 @@ def from_exif(pictures: Pictures) -> Calibration:
 
 
 def exif_focal_length(path: Path, size: Size) -> float | None:
-    """FocalLengthIn35mmFilm in millimetres, None where it is absent or 0 (unknown); ValueError for a cropped image."""
+    """FocalLengthIn35mmFilm in millimetres, None if absent or 0 (unknown); ValueError for a cropped image."""
     with Image.open(path) as image:
         tags = image.getexif().get_ifd(ExifTags.IFD.Exif)
     try:
@@ -190,7 +181,7 @@ def exif_focal_length(path: Path, size: Size) -> float | None:
 
 
 def check_image_size(camera: Calibration, size: Size, what: str) -> None:
-    """ValueError where a calibration is for images of another size."""
+    """Raise ValueError if a calibration is for images of another size."""
     if camera.size is None or camera.size == tuple(size):
         return
     (w, h), (width, height) = camera.size, size
@@ -201,10 +192,10 @@ def check_image_size(camera: Calibration, size: Size, what: str) -> None:
 
 
 def check_plausible(camera: Calibration, size: Size, what: str, images: str) -> str | None:
-    """Describe what is implausible in a camera for images of that size; return None if nothing is.
+    """Describe what is implausible in a camera for images of that size, or None.
 
     Raises:
-        ValueError: no lens has such a view; or the numbers fit as another camera's, and no size stands beside them.
+        ValueError: no lens has such a view; or the numbers fit otherwise, and no size comes with them.
     """
     found = oddities(camera.intrinsics, size)
     if not found:

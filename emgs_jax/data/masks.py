@@ -1,4 +1,4 @@
-"""Masks: pixels of images that are left out, such as people, told by an image for each frame."""
+"""Masks: an image for each frame of pixels that are left out, such as people."""
 
 import re
 from collections.abc import Sequence
@@ -15,20 +15,18 @@ from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.labels import LabelFolder
 from emgs_jax.ops.ranges import ranged
 
-MAX_STRETCH = 0.02  # relative difference of the sides' ratio, of a mask and its image
+MAX_STRETCH = 0.02  # relative difference in aspect of a mask and its image
 
 
 @dataclass(frozen=True)
 class Masks:
-    """Masks in a folder, each with the name of its image and the same sides or fewer pixels."""
+    """Masks in a folder, each with its image's name and aspect."""
 
-    folder: str | None = None  # of images; None: no pixel is left out
-    # names of what is left out, where the images hold ids of classes, see `LabelFolder`; None: what is black is left
-    # out, as for COLMAP and nerfstudio
+    folder: str | None = None  # of images; None: no masks
+    # classes that are left out, if the images hold ids, see `LabelFolder`; None: black is left out, as for COLMAP
     classes: Sequence[str] | None = None
     names: str | None = None  # file that names the ids, see `data.class_file`; needed with `classes`
-    # pixels around what is left out that are left out, too
-    border: int = field(default=2, metadata=ranged(low=0, high=1000))
+    border: int = field(default=2, metadata=ranged(low=0, high=1000))  # pixels by which masks are dilated
 
     def __post_init__(self) -> None:
         if self.classes is None:
@@ -48,12 +46,12 @@ class Masks:
 
     @cached_property
     def _files(self) -> dict[str, Path]:
-        """By the name of the image, without suffix or with it."""
+        """Masks by the name of the image, with or without its suffix."""
         folder = Path(self.folder).expanduser()
         return {stem(path.name): path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
 
     def check(self, names: Sequence[str]) -> None:
-        """ValueError where an image of these names has no mask."""
+        """Raise ValueError if an image of these names has no mask."""
         missing = [] if self.folder is None else [name for name in names if self._file(name) is None]
         if missing:
             raise ValueError(
@@ -65,11 +63,7 @@ class Masks:
         return self._files.get(name, self._files.get(f"{name}.png"))
 
     def read(self, name: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-        """What is left out of an image of (width, height) `size`.
-
-        Raises:
-            BadFrameError: the mask cannot be read, or has other sides than its image.
-        """
+        """True where an image of `size` is left out; BadFrameError if its mask cannot be read or has another aspect."""
         if self.folder is None:
             return np.zeros(size[::-1], bool)
         self.check([name])
@@ -88,25 +82,25 @@ class Masks:
 
 
 def masked(frame: Frame, is_out: Bool[np.ndarray, "h w"]) -> Frame:
-    """The frame with a mask, without the truth there."""
+    """Add a mask to a frame, and remove the truth there."""
     depth = None if frame.depth is None else np.where(is_out, np.float32(0.0), frame.depth)
     labels = None if frame.labels is None else np.where(is_out, np.int32(-1), frame.labels)
     return replace(frame, depth=depth, labels=labels, mask=is_out)
 
 
 def names_of(dataset: Dataset) -> list[str]:
-    """A name for each frame in use: that of its file, or its number in the video where it has none of its own."""
+    """A name for each frame in use: its file's, or its number in a video."""
     files = [dataset.files(index) for index in range(len(dataset))]
     numbers = [*map(getattr(dataset, "number", int), range(len(dataset)))]
     return image_names([found[0] if found else None for found in files], numbers)
 
 
 def image_names(files: Sequence[Path | None], numbers: Sequence[int]) -> list[str]:
-    """Stems of the files if each has its own, else the numbers."""
+    """Stems of the files if they are distinct, else the numbers."""
     stems = [stem(path.name) if path is not None else "" for path in files]
     return stems if all(stems) and len({*stems}) == len(stems) else [f"{number:06d}" for number in numbers]
 
 
 def stem(name: str) -> str:
-    """Name of an image without folder and suffix, and without what COLMAP's lists of pairs cannot hold."""
+    """Name of an image without folder, suffix, and characters that COLMAP's lists of pairs cannot hold."""
     return re.sub(r"[\s#]", "_", name.rpartition("/")[2].rpartition(".")[0] or name)

@@ -1,9 +1,7 @@
-"""Images whose cameras are known: a project of COLMAP, a folder of nerfstudio, and benchmarks without depth.
+"""Images with known cameras but without depth: COLMAP's projects, nerfstudio's folders, and benchmarks.
 
-Their poses are a reference for the path. Those that a program has found are in a unit of their own: only what is
-aligned with a scale says something (`trajectory/ate_sim3_m`). Without depth there is no reference for the map.
-
-Pixels are those that are stored: these programs do not turn images by their EXIF orientation, and poses are of them.
+Their poses are a reference for the trajectory; those of a program have its own unit, so only `trajectory/ate_sim3_m`
+has a meaning. Images are not turned by their EXIF orientation, as these programs do not turn them.
 """
 
 from dataclasses import dataclass
@@ -30,21 +28,20 @@ MODEL_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0")  # sparse/0 stand
 
 @dataclass(frozen=True)
 class Solved:
-    """Images of one camera with the poses and the calibration that another program solved for."""
+    """Images of one camera with poses and calibration from another program."""
 
     images: list[Path]
-    poses: list[Pose | None]  # T_world_camera of each, in the program's unit; None where there is none
-    camera: Calibration  # of all of them
-    source: Path  # the file that poses and camera come from
+    poses: list[Pose | None]  # T_world_camera of each, in the program's unit
+    camera: Calibration  # of all images
+    source: Path  # file of poses and camera
     files: tuple[Path, ...]
-    # seconds of each, where the images stand in order of time; None = from their names
-    times: list[float] | None = None
+    times: list[float] | None = None  # seconds of images in order of time; None: from their names
     note: str | None = None
 
 
 @dataclass(eq=False)
 class PosedImages(Straightened):
-    """Base of the data sets in this file (a `Dataset`); images in the natural order of their folders and names."""
+    """Base of the data sets with poses; images in natural order of folders and names."""
 
     _flags = reading.AS_STORED
 
@@ -75,7 +72,7 @@ class PosedImages(Straightened):
 
 
 def in_order(solved: Solved) -> tuple[list[int], list[float], str | None]:
-    """Rows of the images in their order, the seconds of these, and a note on where those come from."""
+    """Rows of the images in order, their seconds, and a note on the origin of these."""
     if solved.times is not None:
         return [*range(len(solved.images))], solved.times, None
     order, of_order = natural_order(solved.images)
@@ -87,9 +84,8 @@ def in_order(solved: Solved) -> tuple[list[int], list[float], str | None]:
 class Colmap(PosedImages):
     """A project of COLMAP in root or root/sequence: the images that are registered in a sparse model, of one camera."""
 
-    # folder of the model below that; None = the first of MODEL_FOLDERS that has one, of several the largest
-    model: str | None = None
-    images: str = "images"  # folder of the images below that
+    model: str | None = None  # its folder; None: the first of MODEL_FOLDERS that has one, of several the largest
+    images: str = "images"  # folder of the images
 
     name, layout, source = "colmap", COLMAP_LAYOUT, "COLMAP's project"
 
@@ -100,7 +96,7 @@ class Colmap(PosedImages):
 
 @dataclass(eq=False)
 class Nerfstudio(PosedImages):
-    """A folder with nerfstudio's transforms.json, of one camera; sequence None = root itself."""
+    """A folder with nerfstudio's transforms.json, of one camera; sequence None: root itself."""
 
     name, layout, source = "nerfstudio", NERFSTUDIO_LAYOUT, "written by ns-process-data and by many apps"
 
@@ -110,11 +106,11 @@ class Nerfstudio(PosedImages):
 
 
 def find_model(folder: Path, model: str | None) -> SparseModel:
-    """Read a sparse model, of several the largest, or raise an error that names where one was looked for."""
+    """Read a sparse model, of several the largest; errors name the searched folders."""
     places = [folder / name for name in (MODEL_FOLDERS if model is None else (model,))]
     for place in places:
         beside = [place]
-        if model is None and place.name == "0":  # what COLMAP could not join is in several that are numbered
+        if model is None and place.name == "0":  # COLMAP numbers models that it could not join
             numbered = (path for path in place.parent.glob("*") if path.name.isdecimal())
             beside = sorted(numbered, key=lambda path: int(path.name))
         if there := [load_colmap(folder) for folder in beside if is_model(folder)]:
@@ -124,11 +120,7 @@ def find_model(folder: Path, model: str | None) -> SparseModel:
 
 
 def read_colmap(found: SparseModel, folder: Path) -> Solved:
-    """The images of a sparse model, which are in `folder`.
-
-    Raises:
-        ValueError: no image, images of several cameras, a camera that is not read, a damaged file.
-    """
+    """The images of a sparse model, in `folder`; ValueError if they are of several cameras."""
     used = {found.cameras[camera_id] for camera_id in found.camera_ids}
     if len(used) > 1:
         raise ValueError(
@@ -143,11 +135,7 @@ def read_colmap(found: SparseModel, folder: Path) -> Solved:
 
 
 def read_nerfstudio(path: Path) -> Solved:
-    """The frames of a transforms.json; a pose of inf or nan is none.
-
-    Raises:
-        ValueError: no frame, cameras that differ or one that is not read, a damaged file.
-    """
+    """Read the frames of a transforms.json, whose poses may be inf or nan; ValueError if it is damaged."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; expected the layout {NERFSTUDIO_LAYOUT}")
     camera = read_calibration(path)

@@ -11,7 +11,7 @@ import trimesh
 from jaxtyping import Float, Float32
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import STAYS, Frame
+from emgs_jax.data.base import STAYS, Dataset, Frame
 from emgs_jax.data.furniture import Part
 from emgs_jax.data.looks import Looks, draw_looks, paint
 from emgs_jax.data.movers import Lane, Mover, build_movers
@@ -29,7 +29,7 @@ class Scene:
 
 
 @dataclass(eq=False)
-class RayCast:
+class RayCast(Dataset):
     """A data set whose frames are cast on demand; a subclass has name, classes and version, and calls `_show`."""
 
     seed: int = 0  # of all that is drawn, 0 or more
@@ -119,9 +119,6 @@ class RayCast:
             depth, objects = np.where(is_hidden, near, depth), np.where(is_hidden, len(self.parts) + rows, objects)
             normals = np.where(is_hidden[..., None], facing, normals)
         return depth, objects, normals, rays
-
-    def files(self, index: int) -> tuple[()]:
-        return ()
 
     def fingerprint(self) -> str:
         options = {

@@ -1,4 +1,4 @@
-"""A data set without the frames that cannot be read."""
+"""A data set without unreadable frames."""
 
 import contextlib
 import hashlib
@@ -13,25 +13,22 @@ from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.masks import Masks, masked, names_of
 from emgs_jax.data.spool import Spool
 
-MAX_KEPT_BYTES = 2**30  # of frames that were read, uncompressed; the others are read anew
+MAX_KEPT_BYTES = 2**30  # of cached frames, uncompressed; others are read again
 ARRAYS = ("image", "depth", "labels", "moving", "mask")  # of a frame
-MAX_STEP_M = 100.0  # from one frame in use to the next: two that are farther apart show nothing in common
+MAX_STEP_M = 100.0  # between consecutive frames in use; beyond, they show nothing in common
 
 
 class ReadableFrames:
-    """The frames of a data set that a run uses (a `Dataset` itself); windows are made over these.
-
-    Each is read once: mapping, comparison and pictures take the same bits, in a temporary file as far as they fit.
+    """The frames of a data set that a run uses, themselves a `Dataset`, cached in a temporary file.
 
     Args:
-        dataset: all frames.
-        on_bad_frame: `error`: a frame that cannot be read ends the run when it is its turn, a true pose that cannot
-            be read at once; `skip`: all frames are read once here, and those that cannot be read are left out.
-        progress: wraps the frame numbers of that first pass, e.g. tqdm.
-        masks: of the frames; what they leave out has no truth either.
+        on_bad_frame: `error`: an unreadable frame ends the run in its turn, an unreadable true pose at once; `skip`:
+            all frames are read here, and unreadable ones are left out.
+        progress: wraps the frame numbers of that pass, e.g. tqdm.
+        masks: of the frames; masked pixels have no truth either.
 
     Attributes:
-        kept: for each frame in use its index in `dataset`.
+        kept: index in `dataset` of each frame in use.
         skipped: index in `dataset` and reason of the others.
     """
 
@@ -45,7 +42,7 @@ class ReadableFrames:
         if on_bad_frame not in ("error", "skip"):
             raise ValueError(f"on_bad_frame must be error or skip, got {on_bad_frame!r}")
         self._dataset = dataset
-        self._spool, self._places = Spool(), {}  # of each frame that was read, the rest of it and where its arrays are
+        self._spool, self._places = Spool(), {}  # frames without arrays, and the arrays' positions
         for name in ("name", "sequence", "size", "intrinsics", "calibration", "classes", "has_ground_truth"):
             setattr(self, name, getattr(dataset, name))
         self.full_intrinsics = getattr(dataset, "full_intrinsics", None)
@@ -89,7 +86,7 @@ class ReadableFrames:
                 self._places[index] = replace(frame, **dict.fromkeys(ARRAYS)), places
 
     def full(self, index: int) -> np.ndarray:
-        """The image as large as it is on disk; read anew each time."""
+        """The image at its size on disk, not cached."""
         return self[index].image if self.full_intrinsics is None else self._dataset.full(self.kept[index])
 
     def pose(self, index: int) -> np.ndarray | None:
@@ -102,13 +99,13 @@ class ReadableFrames:
         return self._dataset.files(self.kept[index])
 
     def fingerprint(self) -> str:
-        """That of the data set, unless frames are left out."""
+        """The data set's fingerprint, unless frames are left out."""
         whole = self._dataset.fingerprint()
         return hashlib.sha256(repr((whole, self.kept)).encode()).hexdigest() if self.skipped else whole
 
 
 def _unreadable(read: Callable[[int], Frame], indices: Iterable[int]) -> dict[int, str]:
-    """Index and reason of the frames that raise BadFrameError."""
+    """Indices of unreadable frames, with the reasons."""
     reasons = {}
     for index in indices:
         try:
@@ -119,9 +116,9 @@ def _unreadable(read: Callable[[int], Frame], indices: Iterable[int]) -> dict[in
 
 
 def _check_truth(dataset: Dataset, kept: Sequence[int]) -> None:
-    """Raise BadFrameError for the first true pose that is damaged or far from the one before, ValueError if none is."""
-    poses = [dataset.pose(index) for index in kept]  # all of them, before the first frame
-    if not dataset.has_ground_truth:  # what is known may have another unit
+    """Raise BadFrameError if a true pose is damaged or far from the one before, ValueError if there is none."""
+    poses = [dataset.pose(index) for index in kept]  # before the first frame is read
+    if not dataset.has_ground_truth:  # poses may have another unit
         return
     if all(pose is None for pose in poses):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""Base of the data sets on disk: the images in use, straightened and in the size in use, and what goes with them."""
+"""Base of the data sets on disk: images are chosen, undistorted and resized."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -17,30 +17,28 @@ from emgs_jax.data.tones import read_shown
 
 @dataclass(eq=False)
 class Straightened(Dataset):
-    """Frames whose images are read, straightened by one lens and resized, with depths where there are some.
+    """Frames whose images are read, undistorted by one lens and resized, maybe with depth.
 
-    A subclass is a dataclass with its options. It calls `_find`, `_select` and `_use`, and sets `_folder` (which names
-    of files are relative to in the fingerprint), `_images`, `_times` and what else is set below.
+    A subclass is a dataclass of options. It calls `_find`, `_select` and `_use`, and sets `_folder` (to which the
+    fingerprint's file names are relative), `_images`, `_times` and the attributes below.
     """
 
     root: str | None = None  # folder of the data set
-    sequence: str | None = None  # folder below root; where a subclass allows it, None = root itself
-    # start, stop, stride: which of the images that are there, in their order
-    start: int = 0
+    sequence: str | None = None  # folder below root; None: root itself, if a subclass allows it
+    start: int = 0  # start, stop, stride: the images in use
     stop: int | None = None
     stride: int = 1
-    # (width, height) of the frames given out; another aspect than the images' is allowed (fx and fy follow)
-    size: Sequence[int] = (320, 240)
+    size: Sequence[int] = (320, 240)  # (width, height) of the frames, at any aspect
 
-    layout = source = ""  # for messages: what stands where, and where it comes from
+    layout = source = ""  # for messages: expected files, and their origin
     _tones = None  # of images with more than 8 bits
     _flags = 0  # of OpenCV's decoder
-    _depths = None  # file of each image, None where an image has none; None without depths
+    _depths = None  # file of each image or None; None without depths
     _depth_scale = 1.0  # raw units per metre
     _files = ()  # that all frames depend on
 
     def _find(self, sequence: str | None) -> Path:
-        """The folder or file that is asked for, after which the sequence is called if it has no name."""
+        """The folder or file of the sequence, which gets its name if it has none."""
         found = reading.find_sequence(self.root, sequence, self.layout, self.source)
         self.sequence = found.resolve().name if self.sequence is None else str(self.sequence)
         return found
@@ -49,7 +47,7 @@ class Straightened(Dataset):
         return reading.select(count, self.start, self.stop, self.stride, where)
 
     def _use(self, lens: Lens, raw_size: Size, *notes: str | None) -> None:
-        """Straighten by `lens` what is `raw_size` on disk; `notes` are on the images."""
+        """Set the lens and the size of the images on disk, with notes on them."""
         self._lens, self._raw_size, self.size = lens, raw_size, reading.check_size(self.size)
         self.calibration = with_notes(lens.about, self._tones and self._tones.note, *notes)
         self.full_intrinsics = lens.intrinsics
@@ -77,7 +75,7 @@ class Straightened(Dataset):
         return reading.fingerprint(self._folder, self._fingerprinted(), options)
 
     def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        """The image as it is on disk, RGB."""
+        """The image on disk, RGB."""
         return read_shown(self._images[index], self._raw_size, self._tones, self._flags)
 
     def _place(self, index: int) -> tuple[float, str]:
@@ -96,9 +94,9 @@ class Straightened(Dataset):
         return None
 
     def _options(self) -> dict[str, Any]:
-        """What else the frames depend on, beside the content of their files."""
+        """What the frames depend on beside their files' content, for the fingerprint."""
         return {}
 
     def _fingerprinted(self) -> Iterable[Path]:
-        """The files whose content counts."""
+        """The files for the fingerprint."""
         return {file for index in range(len(self)) for file in self.files(index)}

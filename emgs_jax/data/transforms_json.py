@@ -1,4 +1,4 @@
-"""nerfstudio's transforms.json as it is read: camera → world with OpenGL's axes, pixels from the image's corner."""
+"""Read nerfstudio's transforms.json: camera → world with OpenGL's axes, pixels from the image's corner."""
 
 import json
 import math
@@ -14,11 +14,7 @@ from emgs_jax.ops.constants import FLIP
 
 
 def load_transforms(path: Path) -> tuple[list[str], list[list[float]]]:
-    """File and camera → world with OpenCV's axes, 16 numbers row by row, of every frame of a transforms.json.
-
-    Raises:
-        ValueError: the file is no such file, or has no frames; the message names what is wrong with it.
-    """
+    """Read file and T_world_camera (16 numbers, OpenCV's axes) of every frame; ValueError if the file is damaged."""
     try:
         frames = json.loads(path.read_text(encoding="utf-8-sig", errors="replace"))["frames"]
         names = [frame["file_path"] for frame in frames]
@@ -38,7 +34,7 @@ def load_transforms(path: Path) -> tuple[list[str], list[list[float]]]:
 
 
 def with_frames_camera(values: Mapping[str, Any], keys: Collection[str], path: Path) -> Mapping[str, Any]:
-    """`values` with the camera that stands in every frame; ValueError where frames have different ones."""
+    """Add the camera that every frame has to `values`; ValueError if they differ."""
     found = [{key: frame[key] for key in keys & frame.keys()} for frame in _frames(values)]
     whole = [{**{key: values[key] for key in keys & values.keys()}, **own} for own in found]
     for number, camera in enumerate(whole):
@@ -52,9 +48,9 @@ def with_frames_camera(values: Mapping[str, Any], keys: Collection[str], path: P
 
 
 def with_angle_of_view(values: Mapping[str, Any], path: Path) -> Mapping[str, Any]:
-    """`values` with the camera that an angle of view means, as Blender's files have it, where no focal length stands.
+    """Add the centred camera of an angle of view, as in Blender's files, to `values` without a focal length.
 
-    The size is that of the images where it does not stand either, and the centre is in the middle.
+    A missing size is read from the images.
     """
     angle = values.get("camera_angle_x")
     if "fl_x" in values or not _is_number(angle) or not 0 < angle < math.pi:
@@ -76,6 +72,6 @@ def _is_number(value: Any) -> bool:
 
 
 def _frames(values: Mapping[str, Any]) -> list[dict[str, Any]]:
-    """The frames that are mappings; what else stands in their place is refused where they are read."""
+    """The frames that are mappings; others are refused by `load_transforms`."""
     frames = values.get("frames")
     return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []

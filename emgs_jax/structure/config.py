@@ -1,4 +1,4 @@
-"""Settings of the structure; what is not named here passes through to COLMAP in its own words."""
+"""Settings of structure from motion; `options` are passed to COLMAP."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -8,7 +8,7 @@ from emgs_jax.data.masks import Masks
 from emgs_jax.ops.ranges import number, one_of
 
 PARTS = ("extraction", "matching", "verification", "incremental", "global")  # of the options
-# Fewer and shorter adjustments in between: all is adjusted once more in the end.
+# Fewer and shorter bundle adjustments: all is adjusted once more at the end.
 RARE_ADJUSTMENTS = {
     "ba_global_frames_ratio": 1.3,
     "ba_global_points_ratio": 1.3,
@@ -19,48 +19,26 @@ RARE_ADJUSTMENTS = {
 
 @dataclass(frozen=True)
 class StructureConfig:
-    """How COLMAP makes a structure of the images; names and values are pycolmap's.
+    """Structure from motion by COLMAP; names and values are pycolmap's."""
 
-    Args:
-        model: folder of a model, or of several numbered ones, that is taken as it is; or a COLMAP database, which is
-            mapped. None: all is computed.
-        features: FeatureExtractorType; `sift` needs no file, for the others COLMAP fetches a network.
-        matcher: FeatureMatcherType; None: brute force for `sift`, LightGlue or its own for the others.
-        mapper: `incremental` or `global`.
-        camera_model: of the lens, where its distortion is refined.
-        refine_distortion: of a camera that is given; one that is estimated is refined as a whole.
-        masks: in what they leave out nothing is looked for.
-        seed: of all that is drawn.
-        num_threads: -1: all.
-        max_image_size: pixels of the longer side; larger images are searched smaller.
-        max_exhaustive: images; as many as these are matched each with each, more with their neighbours and what place
-            recognition proposes.
-        overlap: neighbours on each side; and one at each power of two beyond.
-        num_similar: images that place recognition proposes for each.
-        options: further options by part (extraction, matching, verification, incremental, global), in pycolmap's words.
-        min_inliers: of a frame that no model holds, registered in the end with fewer than the mapper asks for.
-        max_gap: frames; one that is still without a pose is interpolated between neighbours so near, without points.
-        median_depth: of what a model's images show; its unit, since images do not tell the scale.
-        pixel_std: least standard deviation of a keypoint; that of the residuals where it is larger.
-    """
-
-    model: str | None = None
-    features: str = "sift"
-    matcher: str | None = None
+    model: str | None = None  # folder of an existing model, or of numbered ones; or a COLMAP database, which is mapped
+    features: str = "sift"  # FeatureExtractorType; for all but `sift` COLMAP fetches a network
+    matcher: str | None = None  # FeatureMatcherType; None: brute force for `sift`, LightGlue or its own for the others
     mapper: str = one_of("incremental", "global", default="incremental")
-    camera_model: str = "SIMPLE_RADIAL"
-    refine_distortion: bool = True
-    masks: Masks = field(default_factory=Masks)
+    camera_model: str = "SIMPLE_RADIAL"  # of a lens whose distortion is refined
+    refine_distortion: bool = True  # of a given camera; an estimated one is refined as a whole
+    masks: Masks = field(default_factory=Masks)  # where no features are detected
     seed: int = number(0, low=0, high=2**31 - 1)
-    num_threads: int = number(-1, low=-1, high=1024)
-    max_image_size: int = number(1024, low=64, high=16384)
-    max_exhaustive: int = number(50, low=2, high=10000)
-    overlap: int = number(10, low=1, high=1000)
-    num_similar: int = number(5, low=0, high=1000)
-    min_inliers: int = number(15, low=4, high=1000)
-    max_gap: int = number(3, low=0, high=1000)
-    median_depth: float = number(2.0, low=1e-6, high=1e6)
-    pixel_std: float = number(0.4, low=1e-3, high=100)
+    num_threads: int = number(-1, low=-1, high=1024)  # -1: all
+    max_image_size: int = number(1024, low=64, high=16384)  # longer side in pixels, to which images are reduced
+    max_exhaustive: int = number(50, low=2, high=10000)  # images up to which all pairs are matched
+    overlap: int = number(10, low=1, high=1000)  # of more images: neighbours on each side, and powers of two beyond
+    num_similar: int = number(5, low=0, high=1000)  # and images that place recognition proposes for each
+    min_inliers: int = number(15, low=4, high=1000)  # of a frame that is registered at the end
+    max_gap: int = number(3, low=0, high=1000)  # frames without a pose in a row that are interpolated, without points
+    median_depth: float = number(2.0, low=1e-6, high=1e6)  # of the landmarks: the unit, as images do not tell the scale
+    pixel_std: float = number(0.4, low=1e-3, high=100)  # least standard deviation of a keypoint
+    # further options by part (extraction, matching, verification, incremental, global)
     options: Mapping[str, Any] = field(
         default_factory=lambda: {part: {} for part in PARTS} | {"incremental": RARE_ADJUSTMENTS}
     )

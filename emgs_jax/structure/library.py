@@ -1,4 +1,4 @@
-"""pycolmap, which is loaded when it is needed, and its options and names as a config writes them."""
+"""Load pycolmap on demand, and convert options and names of a config to its own."""
 
 import subprocess
 import sys
@@ -24,7 +24,7 @@ with tempfile.TemporaryDirectory() as folder:
 
 
 def load() -> ModuleType:
-    """The module; ValueError where it is not installed."""
+    """Import pycolmap; ValueError if it is not installed."""
     return load_pycolmap(
         "poses of images are found by pycolmap, which is not installed (for Linux on ARM there is no wheel): "
         "install it from source, or bring predictions with poses (prior=files)"
@@ -32,7 +32,7 @@ def load() -> ModuleType:
 
 
 def bundle_of(model: Any) -> Any:
-    """pycolmap's problem of adjusting all images of a model; nothing is held yet."""
+    """pycolmap's problem of adjusting all images of a model, with nothing held constant."""
     problem = load().BundleAdjustmentConfig()
     for image in model.reg_image_ids():
         problem.add_image(image)
@@ -40,11 +40,7 @@ def bundle_of(model: Any) -> Any:
 
 
 def check_kinds(features: str, matcher: str) -> None:
-    """Try features and a matcher in another process: where they need what this build lacks, COLMAP ends its process.
-
-    Raises:
-        ValueError: it ends.
-    """
+    """Try features and a matcher in another process, which COLMAP ends if this build lacks them; then ValueError."""
     kinds = "FeatureExtractorType", features, "FeatureMatcherType", matcher
     done = subprocess.run([sys.executable, "-c", PROBE, *kinds], capture_output=True, text=True, encoding="utf-8")
     if done.returncode:
@@ -57,11 +53,7 @@ def check_kinds(features: str, matcher: str) -> None:
 
 
 def options_of(name: str, *given: Mapping[str, Any]) -> Any:
-    """An options object of pycolmap with values put into it; the last ones win.
-
-    Raises:
-        ValueError: COLMAP knows no such option, or not this value; the message names those that there are.
-    """
+    """Make an options object of pycolmap; later values win. ValueError, with the known options, for unknown ones."""
     options = getattr(load(), name)()
     for values in given:
         try:
@@ -83,7 +75,7 @@ def _plain(values: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def member(kinds: str, name: str, key: str) -> Any:
-    """The value of one of pycolmap's enumerations by its name in any case; `key` names it in errors."""
+    """A value of one of pycolmap's enumerations by its name in any case; `key` names it in errors."""
     members = {name.lower(): value for name, value in getattr(load(), kinds).__members__.items() if name != "UNDEFINED"}
     if name.lower() not in members:
         raise ValueError(f"prior.structure.{key}={name} is unknown: pycolmap has {', '.join(members)}")

@@ -1,4 +1,4 @@
-"""What COLMAP found, as arrays: poses with their covariances, points, which frame shows which, and the lens."""
+"""COLMAP's result as arrays: poses with covariances, points, their visibility, and the lens."""
 
 import copy
 from collections.abc import Sequence
@@ -18,60 +18,42 @@ NONE = -1  # world of a frame without a pose
 
 @dataclass(frozen=True)
 class World:
-    """One model: a frame of reference and a unit of its own.
+    """One model, with its own frame of reference and unit."""
 
-    Args:
-        points: (l, 3).
-        camera: pycolmap's, of the images that the structure was made of.
-    """
-
-    points: np.ndarray
-    camera: Any
+    points: np.ndarray  # (l, 3)
+    camera: Any  # pycolmap's, of the structure's images
 
 
 @dataclass(frozen=True)
 class Structure:
-    """Poses of a sequence.
+    """Poses of a sequence."""
 
-    Args:
-        worlds: in the order of their first frames.
-        world: (n,) row of the world that holds each frame, or NONE.
-        T_world_camera: (n, 4, 4), NaN where there is none.
-        covariance: (n, 6, 6) of xi, relative to the frame before it in its world: the true pose is T Exp(xi),
-            translation first, in the axes of the camera; NaN where it is not known.
-        landmarks: of each frame, the rows of its world's points that it shows.
-        is_interpolated: (n,) the pose is a guess between neighbours; it shows no landmarks.
-    """
-
-    worlds: Sequence[World]
-    world: np.ndarray
-    T_world_camera: np.ndarray
+    worlds: Sequence[World]  # in the order of their first frames
+    world: np.ndarray  # (n,) row of each frame's world, or NONE
+    T_world_camera: np.ndarray  # (n, 4, 4), NaN without a pose
+    # (n, 6, 6) of xi relative to the frame before in its world, where the true pose is T Exp(xi), translation first, in
+    # the camera's axes; NaN where unknown.
     covariance: np.ndarray
-    landmarks: Sequence[np.ndarray]
-    is_interpolated: np.ndarray
+    landmarks: Sequence[np.ndarray]  # rows of the world's points that each frame shows
+    is_interpolated: np.ndarray  # (n,) the pose is interpolated, without landmarks
 
     @property
     def is_placed(self) -> np.ndarray:
-        """(n,) frames that a world holds by what they show."""
+        """(n,) frames with a pose from landmarks."""
         return (self.world != NONE) & ~self.is_interpolated
 
     def shown(self, frame: int) -> np.ndarray:
-        """The landmarks (k, 3) that a frame shows, in its world."""
+        """The landmarks (k, 3) of a frame, in its world."""
         return self.worlds[self.world[frame]].points[self.landmarks[frame]]
 
     def depths(self, frame: int) -> np.ndarray:
-        """Depths z (k,) of the landmarks that a frame shows."""
+        """Depths z (k,) of a frame's landmarks."""
         T = self.T_world_camera[frame]
         return (self.shown(frame) - T[:3, 3]) @ T[:3, 2]
 
 
 def to_structure(models: Sequence[Any], names: Sequence[str], config: StructureConfig) -> Structure:
-    """The structure of pycolmap's models; a frame that several hold is of the largest.
-
-    Args:
-        models: the largest first.
-        names: of the frames in order; those of the models' images may have another suffix.
-    """
+    """Convert pycolmap's models, the largest first, which gets a frame that several hold; `names` are the frames'."""
     row = {name: index for index, name in enumerate(names)}
     taken: set[int] = set()
     found = []
@@ -105,7 +87,7 @@ def to_structure(models: Sequence[Any], names: Sequence[str], config: StructureC
 
 
 def in_unit(structure: Structure, median_depth: float) -> Structure:
-    """The structure in a unit in which the depths of each world's landmarks have this median."""
+    """Scale each world so that its landmarks' depths have this median."""
     factors = []
     for number in range(len(structure.worlds)):
         frames = np.flatnonzero(structure.world == number)
@@ -115,7 +97,7 @@ def in_unit(structure: Structure, median_depth: float) -> Structure:
 
 
 def scaled(structure: Structure, factors: Sequence[float]) -> Structure:
-    """The structure with the lengths of each world times its factor."""
+    """Multiply the lengths of each world by its factor."""
     T, covariance = structure.T_world_camera.copy(), structure.covariance.copy()
     for number, factor in enumerate(factors):
         frames = np.flatnonzero(structure.world == number)
@@ -126,7 +108,7 @@ def scaled(structure: Structure, factors: Sequence[float]) -> Structure:
 
 
 def interpolated(structure: Structure, max_gap: int) -> Structure:
-    """The structure with poses of frames between two of one world, where these are at most `max_gap` in a row."""
+    """Interpolate the poses of at most `max_gap` frames in a row between two of one world."""
     world, T, guessed = structure.world.copy(), structure.T_world_camera.copy(), structure.is_interpolated.copy()
     placed = np.flatnonzero(structure.world != NONE)
     for before, after in zip(placed[:-1], placed[1:], strict=True):

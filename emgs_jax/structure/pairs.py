@@ -1,4 +1,4 @@
-"""Which images are matched with which: each with each while that is cheap, else neighbours and places seen again."""
+"""Choose pairs of images to match: all while that is cheap, else neighbours and recognised places."""
 
 import itertools
 from collections.abc import Sequence
@@ -14,12 +14,7 @@ MAX_DESCRIPTORS = 500  # of one image
 
 
 def choose_pairs(database: Any, names: Sequence[str], config: StructureConfig) -> list[tuple[str, str]]:
-    """Pairs of names, each once, in the order of the first.
-
-    Args:
-        database: COLMAP's, with the features of all images; those that it lacks are in no pair.
-        names: of the images in the order of time.
-    """
+    """Pairs of the names, in order of time, of images with features in COLMAP's database."""
     ids = {image.name: image.image_id for image in database.read_all_images()}
     names = [name for name in names if name in ids]
     count = len(names)
@@ -33,14 +28,14 @@ def choose_pairs(database: Any, names: Sequence[str], config: StructureConfig) -
 
 
 def _descriptors(database: Any, image: int) -> np.ndarray:
-    """Unit descriptors of an image, evenly chosen ones of many."""
+    """Unit descriptors of an image, at most MAX_DESCRIPTORS, evenly chosen."""
     found = np.asarray(database.read_descriptors(image).to_float().data, np.float32)
     found = found[np.linspace(0, len(found) - 1, min(len(found), MAX_DESCRIPTORS)).astype(int)]
     return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-6)
 
 
 def similar(descriptors: Sequence[np.ndarray], config: StructureConfig) -> set[tuple[int, int]]:
-    """Pairs of rows that look most alike, by VLAD, and are no neighbours: `num_similar` for each image."""
+    """The `num_similar` most similar rows, by VLAD, for each image, except for neighbours, as pairs."""
     if not config.num_similar:
         return set()
     words = train_words(np.concatenate(descriptors), (NUM_WORDS, MAX_TRAINING, NUM_ITERATIONS), config.seed)

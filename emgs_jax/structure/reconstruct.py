@@ -1,4 +1,4 @@
-"""From images to models: COLMAP's features, matches and mapper, in a folder that an interrupted call goes on in."""
+"""Reconstruct models from images by COLMAP, in a folder from which an interrupted call resumes."""
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -13,10 +13,9 @@ from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.library import bundle_of, check_kinds, load, member, options_of
 from emgs_jax.structure.pairs import choose_pairs
 
-BATCH = 8  # images of one call of COLMAP, so that the bar moves
-PAIRS = 400  # likewise
+BATCH, PAIRS = 8, 400  # images and pairs of one call of COLMAP, so that the bar moves
 MIN_IMAGES = 3  # of a model, that no larger one holds
-MIN_FOR_CENTER = 30  # images
+MIN_FOR_CENTER = 30  # images to refine the principal point
 MIN_DEPTH = 0.01  # of a point, in median depths of the image
 FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
 DATABASE, IMAGES = "database.db", "images"
@@ -24,29 +23,17 @@ SECONDS = 0.5, 0.05, 0.6  # of two cores: features of a 640x480 image, a pair, a
 
 
 class Shots(NamedTuple):
-    """Images of one camera.
+    """Images of one camera."""
 
-    Args:
-        names: of each, once.
-        read: RGB uint8 (h, w, 3) of image 0 .. n-1; raises BadFrameError.
-        size: (width, height).
-        camera: COLMAP's model and its parameters in COLMAP's pixels, "PINHOLE", (fx, fy, cx, cy); no parameters: its
-            default focal length is where the calibration begins.
-        is_calibrated: True where only the distortion may still change.
-    """
-
-    names: Sequence[str]
-    read: Callable[[int], np.ndarray]
-    size: tuple[int, int]
-    camera: tuple[str, tuple[float, ...]]
-    is_calibrated: bool
+    names: Sequence[str]  # distinct
+    read: Callable[[int], np.ndarray]  # RGB uint8 (h, w, 3) of an image; raises BadFrameError
+    size: tuple[int, int]  # (width, height)
+    camera: tuple[str, tuple[float, ...]]  # COLMAP's model, and parameters in its pixels, or none: its default start
+    is_calibrated: bool  # only the distortion may still change
 
 
 def map_images(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
-    """COLMAP's models of the images, the one of most images first.
-
-    Args:
-        folder: for the database, from which a call that was interrupted goes on.
+    """COLMAP's models of the images, the largest first; `folder` keeps the database, to resume from.
 
     Raises:
         ValueError: the images do not determine a structure; with the reason and a remedy.
@@ -59,11 +46,7 @@ def map_images(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]
 
 
 def map_database(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
-    """COLMAP's models of the matches in a folder's database; frames that none holds are tried once more.
-
-    Raises:
-        ValueError: it cannot be read, or there is no model; with the reason and a remedy.
-    """
+    """Map the matches in a folder's database, and register remaining frames; ValueError, with a reason, if it fails."""
     found = find_models(shots, config, folder)
     check_found(found, shots, config, folder)
     register_rest(found, config, folder)
@@ -73,7 +56,7 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> list[An
 
 
 def _say(shots: Shots, config: StructureConfig) -> None:
-    """What many images will cost, before it is spent."""
+    """Announce the cost of many images."""
     count, per_image = len(shots.names), 2 * (config.overlap + config.num_similar)
     pairs = count * (count - 1) // 2 if count <= config.max_exhaustive else count * per_image // 2
     features, pair, mapped = SECONDS
@@ -127,7 +110,7 @@ def detect(shots: Shots, config: StructureConfig, folder: Path) -> None:
 
 
 def _write(shots: Shots, index: int, images: Path) -> bool:
-    """Write an image for COLMAP; False where it cannot be read: its frame has no pose, and the run says why."""
+    """Write an image for COLMAP; False if it cannot be read: its frame gets no pose, and the run says why."""
     try:
         image = shots.read(index)
     except BadFrameError:
@@ -137,11 +120,7 @@ def _write(shots: Shots, index: int, images: Path) -> bool:
 
 
 def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
-    """The folder of masks under the names that COLMAP looks for; '' without any.
-
-    Raises:
-        ValueError: there are none, or one has another size than its image.
-    """
+    """Write masks under COLMAP's names and return their folder, or ''; ValueError if one is missing or does not fit."""
     if config.masks.folder is None:
         return ""
     own = folder / "masks"
@@ -154,14 +133,14 @@ def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
 
 
 def matcher_of(config: StructureConfig) -> Any:
-    """pycolmap's FeatureMatcherType: the one that is named, else that of the features."""
+    """pycolmap's FeatureMatcherType: the given one, else that of the features."""
     features = config.features.lower()
     kinds = {"sift": "sift_bruteforce", "aliked": "aliked_lightglue", "loma": features}
     return member("FeatureMatcherType", config.matcher or kinds[features.split("_")[0]], "matcher")
 
 
 def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
-    """Match and verify the pairs that `choose_pairs` names; those that are in the database stay."""
+    """Match and verify the pairs of `choose_pairs`; those in the database are kept."""
     pycolmap = load()
     database, listed = folder / DATABASE, folder / "pairs.txt"
     matching = options_of(
@@ -193,12 +172,12 @@ def match(shots: Shots, config: StructureConfig, folder: Path) -> None:
 
 
 def refined_lens(shots: Shots, config: StructureConfig) -> tuple[bool, bool]:
-    """Whether the focal length is refined, and the distortion."""
+    """Whether to refine the focal length, and the distortion."""
     return not shots.is_calibrated, not shots.is_calibrated or config.refine_distortion
 
 
 def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
-    """Run the mapper; models in the order of their numbers of images."""
+    """Run the mapper; the largest model first."""
     pycolmap = load()
     is_free, is_bent = refined_lens(shots, config)
     common = {"num_threads": config.num_threads, "random_seed": config.seed}
@@ -237,7 +216,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path) -> list[Any
 
 
 def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) -> None:
-    """Register images that no model holds with fewer inliers, in the model that shows most of what they show."""
+    """Register remaining images with fewer inliers."""
     pycolmap = load()
     with pycolmap.Database.open(folder / DATABASE) as opened:
         names = {image.image_id: image.name for image in opened.read_all_images()}
@@ -261,9 +240,9 @@ def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) 
 
 
 def adjust(model: Any, shots: Shots, config: StructureConfig) -> None:
-    """Adjust all of a model once more, by a robust loss, with the centre of a camera that is being calibrated.
+    """Adjust a model once more with a robust loss, and the principal point of a camera that is being calibrated.
 
-    The mapper's own adjustments weigh all residuals by their squares and hold the centre in the middle of the image.
+    The mapper itself uses squared residuals and holds the principal point in the middle of the image.
     """
     pycolmap, (is_free, is_bent) = load(), refined_lens(shots, config)
     drop_points_at_cameras(model)
@@ -279,7 +258,7 @@ def adjust(model: Any, shots: Shots, config: StructureConfig) -> None:
     problem = bundle_of(model)  # `pycolmap.bundle_adjustment` prints whatever the level of the log
     problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
     pycolmap.create_default_ceres_bundle_adjuster(options, problem, model).solve()
-    # What the loss let go may lie anywhere now.
+    # The robust loss may have moved outliers anywhere.
     filters = options_of("IncrementalPipelineOptions", config.options.get("incremental", {})).mapper
     observations = pycolmap.ObservationManager(model)
     observations.filter_all_points3D(filters.filter_max_reproj_error, filters.filter_min_tri_angle)
@@ -288,7 +267,7 @@ def adjust(model: Any, shots: Shots, config: StructureConfig) -> None:
 
 
 def drop_points_at_cameras(model: Any) -> None:
-    """Delete points that lie at a camera that shows them: their rays tell nothing, and no covariance is finite."""
+    """Delete points at a camera that shows them: their rays determine nothing, and no covariance would be finite."""
     for image in [image for image in model.images.values() if image.has_pose]:
         keys = [point.point3D_id for point in image.points2D if point.has_point3D()]
         pose = image.cam_from_world().matrix()
@@ -298,7 +277,7 @@ def drop_points_at_cameras(model: Any) -> None:
 
 
 def check_found(found: Sequence[Any], shots: Shots, config: StructureConfig, folder: Path) -> None:
-    """Raise ValueError where no model was found, with the likeliest reason."""
+    """Raise ValueError, with the likeliest reason, if no model was found."""
     pycolmap = load()
     if found:
         return

@@ -1,4 +1,4 @@
-"""The structure of a data set's images, and the camera of images whose intrinsics nobody knows."""
+"""The structure of a data set's images, and self-calibration."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
@@ -16,15 +16,11 @@ from emgs_jax.structure.model import Structure, to_structure
 from emgs_jax.structure.reconstruct import Shots
 from emgs_jax.structure.store import make_models, models_of
 
-ESTIMATED = "structure"  # of a data set's calibration: the key of the structure that its camera is from
+ESTIMATED = "structure"  # in a data set's calibration: key of the structure that its camera is from
 
 
 def structure_of(dataset: Dataset, config: StructureConfig, folder: Path | None) -> tuple[Structure, bool]:
-    """The structure of a data set, and True if its images are straight, whatever lens the structure has.
-
-    Args:
-        folder: of a run, which keeps it.
-    """
+    """The structure of a data set, kept in `folder`, and True if its images are undistorted, whatever the lens."""
     names = names_of(dataset)
     key = dataset.calibration.get(ESTIMATED)
     if key is not None and (models := models_of(key, folder)) is not None:
@@ -40,10 +36,7 @@ def structure_of(dataset: Dataset, config: StructureConfig, folder: Path | None)
 def calibrate(
     pictures: Pictures, config: StructureConfig, folder: Path | None = None
 ) -> tuple[Calibration, dict[str, Any]]:
-    """The camera of images, by COLMAP's self-calibration with all of them, and what to say of it.
-
-    It begins at the focal length that the first image's EXIF tells, else at COLMAP's default.
-    """
+    """Calibrate a camera by COLMAP from all images, starting at the first one's EXIF or a default, and describe it."""
     if config.camera_model not in PERSPECTIVE:
         raise ValueError(f"prior.structure.camera_model={config.camera_model}: there are {', '.join(PERSPECTIVE)}")
     names = image_names([*pictures.files] or [None] * pictures.count, pictures.numbers or range(pictures.count))
@@ -65,7 +58,7 @@ def calibrate(
 
 
 def _exif_focal(pictures: Pictures) -> float | None:
-    """Focal length in pixels by the EXIF of the first image; None where it does not tell."""
+    """Focal length in pixels by the EXIF of the first image, or None."""
     if not pictures.files:
         return None
     try:
@@ -75,7 +68,7 @@ def _exif_focal(pictures: Pictures) -> float | None:
 
 
 def full_images(dataset: Dataset) -> tuple[Callable[[int], np.ndarray], tuple[int, int], tuple[float, ...]]:
-    """A function that reads an image as large as it is on disk, straight; its (width, height) and intrinsics."""
+    """A function that reads an undistorted image at its size on disk; (width, height) and intrinsics there."""
     intrinsics = getattr(dataset, "full_intrinsics", None)
     if intrinsics is None:
         return lambda index: dataset[index].image, tuple(dataset.size), tuple(dataset.intrinsics)
@@ -84,7 +77,7 @@ def full_images(dataset: Dataset) -> tuple[Callable[[int], np.ndarray], tuple[in
 
 
 def pinhole_of(intrinsics: Sequence[float], config: StructureConfig) -> tuple[str, tuple[float, ...]]:
-    """COLMAP's camera of a straight image, whose distortion may still be refined."""
+    """COLMAP's camera of an undistorted image, whose distortion may still be refined."""
     fx, fy, cx, cy = intrinsics
     is_square = abs(fx / fy - 1) < 1e-3
     if not config.refine_distortion:

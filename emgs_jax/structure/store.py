@@ -1,4 +1,4 @@
-"""Where a structure is kept: in the run's folder and in a cache, under a key of what it was made from."""
+"""Keep structures in a run's folder and in a cache, under a key of their inputs."""
 
 import hashlib
 import json
@@ -23,14 +23,14 @@ from emgs_jax.structure.library import load
 from emgs_jax.structure.reconstruct import DATABASE, Shots, map_database, map_images
 
 ABOUT = "structure.json"
-NOT_OF_MODELS = ("model", "median_depth", "pixel_std", "max_gap")  # settings of what is made of the models
+NOT_OF_MODELS = ("model", "median_depth", "pixel_std", "max_gap")  # settings that do not change the models
 PARTS = ("cameras", "images")
 CACHE = Path("~/.cache/emgs_jax/structure")
 SQLITE = b"SQLite format 3\0"  # how its files begin
 
 
 def key_of(shots: Shots, config: StructureConfig) -> str:
-    """Hex digest of the images' pixels, the camera, the settings and COLMAP's version."""
+    """Hex digest of pixels, camera, settings and COLMAP's version."""
     settings = {name: value for name, value in asdict(config).items() if name not in NOT_OF_MODELS}
     settings["masks"] = settings["masks"] if config.masks.folder is not None else None
     about = [settings, shots.camera, shots.is_calibrated, [*shots.names], load().__version__]
@@ -44,13 +44,10 @@ def key_of(shots: Shots, config: StructureConfig) -> str:
 
 
 def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> tuple[str, list[Any]]:
-    """The key and pycolmap's models of images, the largest first: made before, or made here and kept.
-
-    Args:
-        folder: `structure/` of a run; None: the cache alone keeps them.
+    """Load or make the models of images, the largest first, and their key; `folder` is `structure/` of a run.
 
     Raises:
-        ValueError: the images do not determine a structure, or `config.model` is none of theirs.
+        ValueError: the images do not determine a structure, or `config.model` is of others.
     """
     if config.model is not None:
         models = given_models(Path(config.model).expanduser(), shots, config)
@@ -62,7 +59,7 @@ def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> t
     places = places_of(key, folder)
     cached = places[-1]
     with ExitStack() as stack:
-        with suppress(OSError):  # a cache that cannot be written is shared by nobody
+        with suppress(OSError):  # a cache that cannot be written is not shared
             cached.parent.mkdir(parents=True, exist_ok=True)
             stack.enter_context(FileLock(cached.with_suffix(".lock")))  # another run may be making the same
         there = kept_at(key, places)
@@ -79,13 +76,13 @@ def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> t
 
 
 def models_of(key: str, folder: Path | None) -> list[Any] | None:
-    """Models that were made before, by their key; None where neither the run's folder nor the cache has them."""
+    """Load models by their key from the run's folder or the cache; None if neither has them."""
     there = kept_at(key, places_of(key, folder))
     return None if there is None else read_models(there)
 
 
 def places_of(key: str, folder: Path | None) -> list[Path]:
-    """Where models of this key are kept: a run's folder, if there is one, and the cache."""
+    """The places for models of this key: a run's folder, if any, and the cache."""
     return [*([] if folder is None else [folder]), CACHE.expanduser() / key]
 
 
@@ -95,7 +92,7 @@ def kept_at(key: str, places: Sequence[Path]) -> Path | None:
 
 
 def _made(shots: Shots, config: StructureConfig, key: str, places: Sequence[Path]) -> Path:
-    """Make the models in the first of these folders that can be written, where an interrupted call has begun."""
+    """Make the models in the first writable folder, and resume an interrupted call there."""
     for place in [*places, Path(tempfile.gettempdir()) / f"emgs_structure_{key}"]:
         work = place.with_name(f".{place.name}_{key}")
         try:
@@ -110,7 +107,7 @@ def _made(shots: Shots, config: StructureConfig, key: str, places: Sequence[Path
 
 
 def is_of(place: Path, key: str) -> bool:
-    """True if a folder holds the models of this key."""
+    """Test whether a folder holds the models of this key."""
     try:
         return json.loads((place / ABOUT).read_text(encoding="utf-8"))["key"] == key
     except (OSError, ValueError, KeyError):
@@ -118,7 +115,7 @@ def is_of(place: Path, key: str) -> bool:
 
 
 def write_models(models: Sequence[Any], key: str, place: Path) -> None:
-    """Write models as COLMAP reads them, one folder each, and last what they are of."""
+    """Write models for COLMAP, a folder each, and last their key."""
     _clear(place)
     for number, model in enumerate(models):
         folder = place / str(number)
@@ -129,7 +126,7 @@ def write_models(models: Sequence[Any], key: str, place: Path) -> None:
 
 
 def copy_models(source: Path, place: Path) -> None:
-    """Copy the files as they are: written again they would be in another order, and sums over them in other bits."""
+    """Copy the files: written again they would have another order, and sums over them other bits."""
     _clear(place)
     for folder in [path for path in source.iterdir() if path.name.isdecimal()]:
         shutil.copytree(folder, place / folder.name)
@@ -137,7 +134,7 @@ def copy_models(source: Path, place: Path) -> None:
 
 
 def _clear(place: Path) -> None:
-    """An empty place: other models may be there, of other settings."""
+    """Remove models of other settings."""
     place.mkdir(parents=True, exist_ok=True)
     (place / ABOUT).unlink(missing_ok=True)
     for folder in [path for path in place.iterdir() if path.name.isdecimal()]:
@@ -145,11 +142,7 @@ def _clear(place: Path) -> None:
 
 
 def read_models(place: Path) -> list[Any]:
-    """Read the models of a folder: itself, or those that are numbered below it, the largest first.
-
-    Raises:
-        ValueError: there is none, or one is damaged.
-    """
+    """Read the model of a folder, or its numbered ones, the largest first; ValueError if none or a damaged one."""
     pycolmap = load()
     below = [place, *sorted((path for path in place.glob("*") if path.name.isdecimal()), key=lambda p: int(p.name))]
     found = [folder for folder in below if all(any(folder.glob(f"{part}.*")) for part in PARTS)]
@@ -167,16 +160,12 @@ def read_models(place: Path) -> list[Any]:
 
 
 def stems_of(model: Any) -> list[str]:
-    """Names of a model's images that have a pose."""
+    """Names of a model's images with a pose."""
     return sorted(stem(image.name) for image in model.images.values() if image.has_pose)
 
 
 def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any]:
-    """The models of `prior.structure.model`: a folder of models, or a database that is mapped in a copy.
-
-    Raises:
-        ValueError: it is of other images, none, or damaged.
-    """
+    """Read the models of `prior.structure.model`, or map a copy of its database; ValueError if that fails."""
     database = place if place.suffix == ".db" else place / DATABASE
     key = f"prior.structure.model={config.model}"
     if not place.exists():

@@ -25,22 +25,18 @@ def camera_in_world(image: Any) -> Float[np.ndarray, "4 4"]:
 def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict[int, Float[np.ndarray, "6 6"]]:
     """Covariance of xi of each image's pose relative to the pose before it, for the unit that fits all of them best.
 
-    A map is made of the frames before, at their poses: what they err alike moves the whole map, and a pose that is
-    right beside theirs is right in it. So the covariance is that of the motion T_before_image, of which xi is
-    xi_i - Ad(T_i_before) xi_before. The first pose is held.
+    A map is made of the frames before, so an error that they share moves the whole map and does not count: the
+    covariance is of the motion T_before_image, whose xi is xi_i - Ad(T_i_before) xi_before. The first pose is held.
 
-    What a common factor of all lengths changes is no error of a pose: the factor s = sum(w_r xi_r) that some of the
-    frames agree on is taken out, xi_i - g_i s with g_i the change of xi_i by log s. Residuals have the standard
-    deviation that they show, or `pixel_std` if that is larger.
-
-    Args:
-        images: by frame, in order. Frames whose covariance cannot be found are left out.
+    A common factor of all lengths is no error either: the factor s = sum(w_r xi_r) of some of the frames is removed,
+    xi_i - g_i s, where g_i is the change of xi_i by log s. The standard deviation of residuals is their own, or
+    `pixel_std` if that is larger. Frames without a covariance are left out.
     """
     found = _covariance(model, next(iter(images.values())))
     if found is None:
         return {}
     first, *others = images
-    # An image that shows no point is no variable of the problem.
+    # An image without points is no variable of the problem.
     others = [frame for frame in others if found.get_cam_cov_from_world(images[frame].image_id) is not None]
     frames = [first, *others]
     if len(frames) < 3:
@@ -67,7 +63,7 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
         mixed = np.outer(with_unit[a], unit[b]) + np.outer(unit[a], with_unit[b])
         return between(a, b) - mixed + variance * np.outer(unit[a], unit[b])
 
-    # The mean length of an error of standard deviation s along both axes is s sqrt(pi / 2).
+    # The mean length of a 2D error of standard deviation s is s sqrt(pi / 2).
     scale = max(2 / np.pi * model.compute_mean_reprojection_error() ** 2, pixel_std**2)
     spread = {first: np.zeros((6, 6))}
     for before, frame in pairwise(frames):
@@ -81,7 +77,7 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
 def _covariance(model: Any, first: Any) -> Any:
     """pycolmap's covariances of all poses, for residuals of one pixel; None if the problem is singular.
 
-    The pose of the image `first` is held, and of what it shows the point that most images show, which fixes the unit.
+    Held are the pose of the image `first` and, for the unit, its point that most images show.
     """
     pycolmap = load()
     shown = {point.point3D_id for point in first.points2D if point.has_point3D()}
@@ -102,7 +98,7 @@ def _covariance(model: Any, first: Any) -> Any:
 
 
 def _spread(count: int, most: int) -> np.ndarray:
-    """Rows 1 to count - 1, evenly chosen, `most` at most."""
+    """At most `most` rows, evenly chosen from 1 to count - 1."""
     return np.unique(np.linspace(1, count - 1, min(count - 1, most)).astype(int))
 
 

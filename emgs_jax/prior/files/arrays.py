@@ -1,4 +1,4 @@
-"""Arrays of files of anyone, checked: what is wrong is named with its file and key."""
+"""Read and check arrays of other programs; errors name file and key."""
 
 import contextlib
 import json
@@ -14,8 +14,8 @@ from emgs_jax.io.npz import npz_names, read_npz
 from emgs_jax.io.packages import extra
 from emgs_jax.prior.files.view import Intrinsics, View, usable
 
-MAX_POSITION = 1e6  # in the unit of the file
-EXR_CHANNELS = ("Z", "Y", "R", "V")  # of which the first that is there is the depth
+MAX_POSITION = 1e6  # in the file's unit
+EXR_CHANNELS = ("Z", "Y", "R", "V")  # the first that exists is the depth
 
 
 def files_of(folder: Path, suffix: str) -> list[Path]:
@@ -26,7 +26,7 @@ def files_of(folder: Path, suffix: str) -> list[Path]:
 
 @contextlib.contextmanager
 def reading(path: Path, what: str, *errors: type[Exception]) -> Iterator[None]:
-    """Let what fails here be a ValueError that names the file."""
+    """Turn errors into a ValueError that names the file."""
     try:
         yield
     except (ValueError, OSError, *errors) as error:
@@ -34,7 +34,7 @@ def reading(path: Path, what: str, *errors: type[Exception]) -> Iterator[None]:
 
 
 def load_npz(path: Path, names: Sequence[str] = (), optional: Sequence[str] = ()) -> dict[str, np.ndarray]:
-    """Arrays of an .npz, compressed or not; ValueError names the file and what it lacks and has."""
+    """Read arrays of an .npz; ValueError names the file and what it lacks and has."""
     try:
         with path.open("rb") as handle:
             return read_npz(handle, names, optional, may_be_compressed=True)
@@ -43,7 +43,7 @@ def load_npz(path: Path, names: Sequence[str] = (), optional: Sequence[str] = ()
 
 
 def names_in(path: Path) -> list[str]:
-    """Names of the arrays of an .npz; none where it is none."""
+    """Names of the arrays of an .npz; none if it is no .npz."""
     try:
         with path.open("rb") as handle:
             return npz_names(handle)
@@ -57,7 +57,7 @@ def load_npy(path: Path) -> np.ndarray:
 
 
 def load_exr(path: Path) -> np.ndarray:
-    """Depths of an OpenEXR file; needs the package OpenEXR, which raises what it likes."""
+    """Read depths of an EXR file by the package OpenEXR."""
     exr = extra("OpenEXR", f"{path}: EXR needs the package OpenEXR", "exr")
     with reading(path, "EXR", Exception), exr.File(str(path), separate_channels=True) as file:
         channels = {name: np.array(channel.pixels) for name, channel in file.channels().items()}
@@ -73,7 +73,7 @@ def load_json(path: Path) -> Any:
 
 
 def load_numbers(path: Path, shape: tuple[int, ...]) -> np.ndarray:
-    """A text file of numbers, inf and nan among them."""
+    """Read a text file of numbers, inf and nan among them."""
     with reading(path, f"list of numbers {shape}"):
         return np.array([float(word) for word in path.read_text(encoding="utf-8-sig").split()]).reshape(shape)
 
@@ -86,7 +86,7 @@ def as_numbers(values: Any, where: str, what: str) -> np.ndarray:
 
 
 def as_poses(values: Any, where: str) -> np.ndarray:
-    """T_world_camera (n, 4, 4) of (n, 3, 4), (n, 4, 4) or (n, 16); all of a pose is NaN where some is not finite."""
+    """T_world_camera (n, 4, 4) of (n, 3, 4), (n, 4, 4) or (n, 16); NaN for a pose that is not finite."""
     poses = as_numbers(values, where, "a matrix of 4 by 4 numbers, camera -> world")
     poses = poses.reshape(-1, 4, 4) if poses.shape[1:] == (16,) else poses
     if poses.shape[1:] == (3, 4):
@@ -117,13 +117,7 @@ def as_intrinsics(values: Any, where: str) -> Intrinsics:
 def as_view(
     source: str, geometry: np.ndarray, confidence: np.ndarray | None = None, intrinsics: Intrinsics | None = None
 ) -> View:
-    """A view, checked.
-
-    Args:
-        geometry: depths (h, w) or (h, w, 1), or points (h, w, 3).
-        confidence: (h, w) or (h, w, 1), at least 1 where there is a depth.
-        intrinsics: of this grid.
-    """
+    """Check and make a view of depths (h, w) or points (h, w, 3), a confidence (h, w) of at least 1, and intrinsics."""
     geometry = _plane(geometry)
     if geometry.dtype.kind not in "fui" or geometry.ndim not in (2, 3) or geometry.shape[2:] not in ((), (3,)):
         raise ValueError(f"{source} must be depths (h, w) or points (h, w, 3), got {geometry.dtype} {geometry.shape}")

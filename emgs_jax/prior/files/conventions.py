@@ -1,4 +1,4 @@
-"""Do poses and depths fit each other? What is of another convention or unit is found out by the depths of two views."""
+"""Check that poses and depths of two views fit, and recognise other conventions and units."""
 
 import contextlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
@@ -13,18 +13,18 @@ from emgs_jax.data.base import BadFrameError, Frame
 from emgs_jax.data.pose_conventions import EXPECTED, READINGS
 from emgs_jax.data.readable import ReadableFrames
 
-MAX_MISFIT = 0.02  # of the depth, median; below, all is right enough whatever else fits
-MIN_GAIN, GOOD_MISFIT = 3.0, 0.05  # by which another convention must fit better to be named, and how well at least
+MAX_MISFIT = 0.02  # median, relative; below, no other convention is tried
+MIN_GAIN, GOOD_MISFIT = 3.0, 0.05  # factor by which another convention must fit better, and its largest misfit
 MIN_SHARED = 100  # points
-STEP = 4  # every fourth pixel of every fourth row
+STEP = 4  # between compared pixels
 FACTORS = np.geomspace(1e-3, 1e3, 241)  # of depths in another unit: 6 % apart
-MIN_FACTOR = 2.0  # what is nearer to 1 is a prediction's error
+MIN_FACTOR = 2.0  # smaller factors are errors of the prediction
 KNOWN_SCALES = 256.0, 1000.0, 4000.0, 5000.0, 6553.5  # raw units a metre, of KITTI, most sensors, L515, TUM, Replica
-NUM_PAIRS, GAP = 4, 4  # of frames, and how far apart they are
+NUM_PAIRS, GAP = 4, 4  # of frames, and frames between them
 
 
 class Sight(NamedTuple):
-    """A view: points (h, w, 3) of its camera, where they can be used, and its pose."""
+    """A view: camera-frame points, usable pixels and pose."""
 
     points: Float[np.ndarray, "h w 3"]
     mask: Bool[np.ndarray, "h w"]
@@ -34,16 +34,10 @@ class Sight(NamedTuple):
 def check_conventions(
     pairs: Iterable[tuple[Sight, Sight]], intrinsics: Sequence[float], source: str, max_misfit: float
 ) -> str:
-    """Say by how much the depths of two views differ.
-
-    Args:
-        pairs: of views that see the same.
-        intrinsics: fx, fy, cx, cy.
-        source: where poses and depths are from.
-        max_misfit: median of |log of the ratio| of depths up to which a map can be made.
+    """Describe by how much the depths of pairs of views differ, as the median of |log of the ratio|.
 
     Raises:
-        ValueError: they differ by more, or poses or depths of another convention or unit fit each other much better.
+        ValueError: they differ by more than `max_misfit`, or fit much better in another convention or unit.
     """
     pairs = [*pairs]
     own = median_misfit(pairs, intrinsics, lambda sight: sight)
@@ -73,7 +67,7 @@ def median_misfit(
     read: Callable[[Sight], Sight],
     has_own_scales: bool = False,
 ) -> float:
-    """`misfit` of the pairs as `read` takes them, 0 without any."""
+    """Median `misfit` of the pairs after `read`; 0 without any."""
     with np.errstate(divide="ignore", invalid="ignore"):  # where there is no depth
         sights = [(read(a), read(b)) for a, b in pairs]
     moved = [(a, b, np.linalg.inv(a.T_world_camera) @ b.T_world_camera) for a, b in sights]
@@ -84,10 +78,9 @@ def median_misfit(
 def misfit(
     a: Sight, b: Sight, T_a_b: Float[np.ndarray, "4 4"], intrinsics: Sequence[float], has_own_scales: bool = False
 ) -> float:
-    """Median of |log of the ratio| of the depths of b's points in a and those that a has there; inf for too few.
+    """Median of |log of the ratio| of the depths of b's points in a and a's own; inf for too few.
 
-    Args:
-        has_own_scales: of the log of the ratio the median is taken off first.
+    With `has_own_scales` the median of the log is subtracted first.
     """
     fx, fy, cx, cy = intrinsics
     points = b.points[::STEP, ::STEP][b.mask[::STEP, ::STEP]] @ T_a_b[:3, :3].T + T_a_b[:3, 3]
@@ -106,7 +99,7 @@ def misfit(
 
 
 def _readings() -> dict[str, Callable[[Sight], Sight]]:
-    """Convert a sight to other conventions, by words for each."""
+    """Functions that convert a sight to other conventions, by description."""
     found: dict[str, Callable[[Sight], Sight]] = {
         f"the poses are taken as {words}": partial(_posed, change=change) for words, change in READINGS.items()
     }
@@ -132,19 +125,19 @@ def _in_camera(sight: Sight) -> Sight:
 
 
 def _mirrored(sight: Sight) -> Sight:
-    """The sight whose depths are those of the pixels at the other side."""
+    """Mirror the depths, left for right."""
     depth = sight.points[..., 2]
     rays = sight.points / np.where(depth > 0, depth, 1)[..., None]
     return Sight(rays * depth[:, ::-1, None], sight.mask & sight.mask[:, ::-1], sight.T_world_camera)
 
 
 def times(sight: Sight, factor: float | Float[np.ndarray, "h w"]) -> Sight:
-    """The sight with its depths times a factor, for all or for each pixel."""
+    """Multiply the depths by a factor, for all or for each pixel."""
     return sight._replace(points=sight.points * np.asarray(factor)[..., None])
 
 
 def _inverse(sight: Sight, factor: float) -> Sight:
-    """The sight whose depths are factor / those that were given."""
+    """Replace the depths by factor / depth."""
     return times(sight, factor / np.square(sight.points[..., 2]))
 
 
@@ -154,12 +147,9 @@ def _stretch(points: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
 
 
 def check_truth(dataset: ReadableFrames, depth_scale: float | None) -> None:
-    """Raise ValueError where true depths and poses fit each other much better in another unit or convention.
+    """Raise ValueError if true depths and poses fit much better in another unit or convention.
 
-    Args:
-        dataset: with ground truth, else nothing is looked at.
-        depth_scale: raw units a metre by which its depths were read, for which the `KNOWN_SCALES` are tried first;
-            None: it is not known.
+    `depth_scale` is raw units a metre by which depths were read, for which the `KNOWN_SCALES` are tried first, or None.
     """
     if not dataset.has_ground_truth:
         return
@@ -186,7 +176,7 @@ def _check_depth_unit(
 
 
 def _pairs(dataset: ReadableFrames) -> Iterator[tuple[Sight, Sight]]:
-    """Frames with depth and pose, evenly spread; one that cannot be read says so when it is its turn."""
+    """Pairs of frames with depth and pose, evenly spread; unreadable ones are reported later."""
     for first in np.unique(np.linspace(0, max(len(dataset) - 1 - GAP, 0), NUM_PAIRS).astype(int)).tolist():
         with contextlib.suppress(BadFrameError):
             a, b = (dataset[row] for row in (first, min(first + GAP, len(dataset) - 1)))

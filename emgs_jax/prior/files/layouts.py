@@ -1,4 +1,4 @@
-"""Readers of what other programs write; names, units and conventions are those of their code."""
+"""Read predictions of other programs; names, units and conventions are those of their code."""
 
 from dataclasses import dataclass
 from functools import cache
@@ -31,38 +31,30 @@ FILES = ("results.npz", "predictions.npz")
 PATCH = 14  # of VGGT's images, whose width is always 518
 SCANNET_UNITS = 1000.0  # per metre, in the 16-bit images that SensReader extracts
 DEPTH_MAPS = Path("stereo") / "depth_maps"
-COLMAP_KINDS = (".geometric.bin", ".photometric.bin")  # the first that is there is read
+COLMAP_KINDS = (".geometric.bin", ".photometric.bin")  # the first that exists is read
 
 
 @dataclass(frozen=True)
 class Export:
-    """An .npz that holds all images of one inference.
-
-    Args:
-        depth, poses, intrinsics: names of the arrays (n, h, w) or (n, h, w, 1), (n, 3 or 4, 4) and (n, 3, 3).
-        confidence, mask: likewise (n, h, w); they may be missing.
-        needs: further arrays that tell it from others.
-        is_inverted: poses are world -> camera.
-        place: what of the image the network sees.
-    """
+    """An .npz of all images of one inference: the names of its arrays."""
 
     layout: str
-    depth: str
-    poses: str
-    intrinsics: str
-    confidence: str
-    place: Place
-    needs: tuple[str, ...] = ()
+    depth: str  # (n, h, w) or (n, h, w, 1)
+    poses: str  # (n, 3 or 4, 4)
+    intrinsics: str  # (n, 3, 3)
+    confidence: str  # (n, h, w), optional like `mask`
+    place: Place  # the part of the image that the network sees
+    needs: tuple[str, ...] = ()  # further arrays that distinguish it
     mask: str = "final_mask"
-    is_inverted: bool = True
+    is_inverted: bool = True  # poses are world -> camera
     is_metric: bool = False
 
 
 def vggt_place(camera: Camera, view: View) -> Part:
-    """VGGT: the width becomes 518, the height whole patches, of which 518 in the middle are kept (mode crop).
+    """VGGT: width 518 and a height of whole patches, cropped to the middle 518 (mode crop).
 
-    In mode pad the longer side becomes 518, and the image stands in the middle of a square. Where both are of this
-    shape the focal length tells.
+    In mode pad the longer side is 518, and the image is centred in a square. If both have this shape, the focal length
+    decides.
     """
     width, height = view.grid
     wide = Part((width, scaled := _patches(width / camera.aspect)), (0, (scaled - height) // 2))
@@ -88,13 +80,13 @@ def _patches(side: float) -> int:
 
 
 def mapanything_crop(camera: Camera, view: View) -> Part:
-    """MapAnything: the image is scaled until it covers the grid, of which it shows the middle."""
+    """MapAnything: the image is scaled to cover the grid, which shows its middle."""
     resize = plan_resize((round(camera.aspect * 10000), 10000), view.grid)
     return Part(resize.scaled, resize.corner)
 
 
 def dust3r_crop(camera: Camera, view: View) -> Part:
-    """DUSt3R and what follows it: the longer side becomes that of the grid, of the rest the middle is kept."""
+    """DUSt3R and its successors: the longer side becomes the grid's, and the other is cropped to its middle."""
     (width, height), aspect = view.grid, camera.aspect
     scaled = (width, round(width / aspect)) if aspect >= 1 else (round(height * aspect), height)
     return Part(scaled, (scaled[0] // 2 - width // 2, scaled[1] // 2 - height // 2))
@@ -114,14 +106,14 @@ EXPORTS = (
 
 
 def find_export(folder: Path) -> Path | None:
-    """The .npz with all images that a folder holds or is."""
+    """The .npz with all images, in a folder or itself; None without one."""
     if folder.suffix == ".npz":
         return folder
     return next((path for place in PLACES for name in FILES if (path := folder / place / name).is_file()), None)
 
 
 def read_export(path: Path) -> Predictions:
-    """An .npz of one of EXPORTS; ValueError where it is of none, or its arrays do not fit each other."""
+    """Read an .npz of one of EXPORTS; ValueError if it is none, or its arrays do not fit."""
     there = names_in(path)
     kinds = [e for e in EXPORTS if {e.depth, e.poses, e.intrinsics, *e.needs} <= {*there}]
     if not kinds:
@@ -174,7 +166,7 @@ def read_cut3r(folder: Path) -> Predictions:
 
 
 def read_colmap_workspace(folder: Path) -> Predictions:
-    """`dense/` of `colmap patch_match_stereo`: stereo/depth_maps/IMAGE.geometric.bin and the sparse model."""
+    """Read `dense/` of `colmap patch_match_stereo`: stereo/depth_maps/IMAGE.geometric.bin and the sparse model."""
     model = find_model(folder, None)
     maps = folder / DEPTH_MAPS
     kind = next((kind for kind in COLMAP_KINDS if any(maps.rglob(f"*{kind}"))), COLMAP_KINDS[0])
@@ -198,14 +190,14 @@ def read_colmap_workspace(folder: Path) -> Predictions:
 
 
 def load_colmap_array(path: Path) -> np.ndarray:
-    """A depth map of COLMAP, float32 (h, w): `WIDTH&HEIGHT&1&`, then the rows, little endian; 0 = none."""
+    """Read a depth map of COLMAP, float32 (h, w), 0 = none: `WIDTH&HEIGHT&1&`, then the rows, little endian."""
     with reading(path, "depth map of COLMAP"):
         width, height, _, values = path.read_bytes().split(b"&", 3)
         return np.frombuffer(values, "<f4").reshape(int(height), int(width))
 
 
 def read_scannet(folder: Path) -> Predictions:
-    """A scan that ScanNet's SensReader extracted: depth/N.png (mm), pose/N.txt, intrinsic/intrinsic_depth.txt."""
+    """Read a scan of ScanNet's SensReader: depth/N.png (mm), pose/N.txt, intrinsic/intrinsic_depth.txt."""
     paths = files_of(folder / "depth", ".png")
     calibration = folder / "intrinsic" / "intrinsic_depth.txt"
     intrinsics = as_intrinsics(load_numbers(calibration, (4, 4)), str(calibration))
@@ -220,7 +212,7 @@ def read_scannet(folder: Path) -> Predictions:
 
 
 def read_record3d(folder: Path) -> Predictions:
-    """An export of Record3D as EXR + JPG: depth/N.exr (m), metadata.json with poses of ARKit's axes."""
+    """Read an export of Record3D as EXR + JPG: depth/N.exr (m), metadata.json with poses in ARKit's axes."""
     paths, path = files_of(folder / "depth", ".exr"), folder / "metadata.json"
     about = load_json(path)
     try:

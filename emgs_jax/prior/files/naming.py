@@ -1,4 +1,4 @@
-"""Which prediction is of which frame, by the names of images and files."""
+"""Match predictions with frames by the names of files."""
 
 from collections import Counter
 from collections.abc import Sequence
@@ -10,12 +10,9 @@ from emgs_jax.data.base import Dataset
 def rows_of(
     dataset: Dataset, names: Sequence[str], folder: Path, may_lack: bool = False, remedy: str = "predict it"
 ) -> list[int | None]:
-    """Row of every frame among `names`: by the name of its image, which all may go on in one way, else in order.
+    """Row of every frame among the predictions' `names`: by image name, apart from a common ending, else by order.
 
-    Args:
-        names: of the predictions in `folder`, without their suffixes.
-        may_lack: a frame without a prediction gets None.
-        remedy: for such a frame, where none may lack.
+    With `may_lack` a frame without a prediction gets None; else ValueError, with `remedy`.
     """
     files = [dataset.files(index)[:1] for index in range(len(dataset))]
     stems = [file[0].stem if file else "" for file in files]

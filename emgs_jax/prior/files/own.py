@@ -1,4 +1,4 @@
-"""The layout of one's own: a file a frame, as docs/predictions.md has it."""
+"""Read our own layout, a file a frame (docs/predictions.md)."""
 
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from emgs_jax.prior.files import arrays
 from emgs_jax.prior.files.arrays import as_intrinsics, as_poses, as_view, files_of, load_json, load_npz, names_in
 from emgs_jax.prior.files.view import Predictions, View, whole_image
 
-SUFFIXES = (".npz", ".exr", ".npy", ".png")  # the first that is there is read
+SUFFIXES = (".npz", ".exr", ".npy", ".png")  # the first that exists is read
 POSES = ("poses.txt", "poses.json")
 KEYS = ("depth", "points", "confidence", "intrinsics")  # of an .npz, beside the pose
 GIVES_POSES = (
@@ -22,7 +22,7 @@ GIVES_POSES = (
 
 
 def read_own(folder: Path, units_per_metre: float) -> Predictions:
-    """A folder with .npz, .exr, .npy or 16-bit .png files, and poses in the .npz, in poses.txt or in poses.json."""
+    """Read a folder of .npz, .exr, .npy or 16-bit .png files, with poses in the .npz, poses.txt or poses.json."""
     suffix = next((suffix for suffix in SUFFIXES if files_of(folder, suffix)), None)
     if suffix is None:
         raise ValueError(
@@ -53,7 +53,7 @@ def read_own(folder: Path, units_per_metre: float) -> Predictions:
 
 
 def _own_pose(path: Path) -> np.ndarray:
-    """The pose (1, 4, 4) of an .npz; an error that says where poses are from where it has none."""
+    """The pose (1, 4, 4) of an .npz."""
     if "T_world_camera" not in names_in(path):
         load_npz(path)  # where it is no .npz at all
         raise ValueError(f"{path} lacks T_world_camera; it has {', '.join(names_in(path))}: {GIVES_POSES}")
@@ -73,7 +73,7 @@ def _read_npz(path: Path) -> View:
 
 
 def _order(times: np.ndarray, names: list[str], path: Path) -> np.ndarray:
-    """Line of a list of poses for each file: that with the number in its name where all have one, else in order."""
+    """Line of a list of poses for each file: by the number in its name if all have one, else in order."""
     numbers = [last_number(name) for name in names]
     if None not in numbers and len({*numbers}) == len(names) and sorted(times) == sorted(numbers):
         line = {time: row for row, time in enumerate(times)}
@@ -87,7 +87,7 @@ def _order(times: np.ndarray, names: list[str], path: Path) -> np.ndarray:
 
 
 def _listed_poses(path: Path, names: list[str]) -> np.ndarray:
-    """Poses of a list, in the order of `names`: of TUM's format row by row, of JSON by name."""
+    """Read a list of poses in the order of `names`: TUM's format by rows, JSON by name."""
     if path.suffix == ".txt":
         times, poses = load_trajectory_tum(path, may_lack=True)
         if len(poses) != len(names):

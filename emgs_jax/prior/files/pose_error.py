@@ -1,4 +1,4 @@
-"""How far off are given poses? What the images say: the epipolar errors of the points that two frames share."""
+"""Estimate the error of given poses from the epipolar errors of points that two frames share."""
 
 from collections.abc import Iterator, Mapping, Sequence
 
@@ -11,25 +11,18 @@ from emgs_jax.keypoints.poses import calibration, essential
 from emgs_jax.keypoints.sift import detect, mutual
 from emgs_jax.ops.constants import MAD_TO_STD
 
-GAPS, NUM_PAIRS = (1, 4, 16), 6  # frames from one of a pair to the other, and pairs with each gap
+GAPS, NUM_PAIRS = (1, 4, 16), 6  # frames between a pair, and pairs with each gap
 NUM_FEATURES, MIN_CONTRAST, MAX_RATIO = 1500, 0.02, 0.8
-MAX_ERROR = 2.0  # pixels, of a match that shows one point
-MIN_MATCHES = 40  # in a pair, which says nothing with fewer
-MIN_PAIRS = 3  # likewise of one gap
+MAX_ERROR = 2.0  # pixels, of an inlier
+MIN_MATCHES, MIN_PAIRS = 40, 3  # in a pair, and with one gap
 
 
 def pose_angle(dataset: Dataset, T_world_cameras: Mapping[int, np.ndarray]) -> float | None:
-    """Standard deviation (rad) per axis of each pose's rotation, and of its position as seen from the scene's depth.
+    """Standard deviation σ (rad) per axis of each pose's rotation, and of its position relative to the scene's depth.
 
-    The epipolar error e of a match has the keypoints' noise in it, which is left alone where the pose fits best, and
-    what both poses err: e² = noise² + 4 f² σ², where rotations and positions of both err by σ. Poses that drift are
-    found out by frames farther apart, so the gap with the largest σ counts. The length of a motion does not show.
-
-    Args:
-        T_world_cameras: (4, 4) by frame index.
-
-    Returns:
-        σ, or None where too few pairs share enough points.
+    The epipolar error e of a match is e² = noise² + 4 f² σ², with the keypoints' noise, which remains for the best
+    pose, and rotations and positions of both views in error by σ. Drift shows in frames farther apart, so the gap with
+    the largest σ counts. The length of a motion does not show. None if too few pairs share enough points.
     """
     of_gaps = [[*_errors(dataset, T_world_cameras, gap)] for gap in GAPS]
     found = [float(np.median(errors)) for errors in of_gaps if len(errors) >= MIN_PAIRS]
@@ -55,9 +48,9 @@ def _errors(dataset: Dataset, T_world_cameras: Mapping[int, np.ndarray], gap: in
 def pair_error(
     images: Sequence[np.ndarray], T_b_a: Float[np.ndarray, "4 4"], intrinsics: Sequence[float]
 ) -> float | None:
-    """Epipolar error (pixels) of two images that is their relative pose's; None where they share too little.
+    """Epipolar error (pixels) of two images due to their relative pose; None if they share too little.
 
-    The error that the noise of so many keypoints alone may cause is in it, so that nothing is certain.
+    It includes the error that the keypoints' noise may cause, so that it is never 0.
     """
     gray = [cv2.cvtColor(image, cv2.COLOR_RGB2GRAY) for image in images]
     (a, of_a), (b, of_b) = (detect(image, NUM_FEATURES, MIN_CONTRAST) for image in gray)
@@ -82,7 +75,7 @@ def sampson(
     b: Float[np.ndarray, "n 2"],
     K: Float[np.ndarray, "3 3"],
 ) -> Float[np.ndarray, " n"]:
-    """Signed Sampson errors (pixels) of matched pixels, whose viewing rays fulfil b' E a = 0 where all is exact."""
+    """Signed Sampson errors (pixels) of matched pixels, by the epipolar constraint b' E a = 0."""
     F = np.linalg.inv(K).T @ E_b_a @ np.linalg.inv(K)
     a, b = (np.column_stack([pixels, np.ones(len(pixels))]) for pixels in (a, b))
     lines_b, lines_a = a @ F.T, b @ F

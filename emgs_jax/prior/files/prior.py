@@ -1,14 +1,12 @@
-"""Predictions of anyone as a prior: a folder with one file a frame, or what other programs write.
+"""Predictions in files as a prior: a file a frame, or the output of other programs.
 
-*Frame.* A file says where its camera is in one world, so every window gets the same answer about a frame: poses are
-relative to the anchor's, points in their own camera. Where the anchor has no pose they are in that world itself.
+*Frame.* All poses are in one world, so every window gets the same prediction of a frame: poses are relative to the
+anchor's, or in that world if the anchor has none.
 
-*Scale.* Lengths are metres, or all of them, poses too, are multiplied by one factor, by which the median depth of the
-first view becomes `median_depth`.
+*Scale.* Lengths are metres, or multiplied by one factor that makes the first view's median depth `median_depth`.
 
-*Grid.* A file has a size of its own. Its pixels are those of the image, resized, and its points lie where its own
-intrinsics have them; without, on the rays of the data set's camera. Only sensors with a calibration of their own
-(ScanNet) are looked up ray by ray.
+*Grid.* A file's pixels are those of the resized image; its points lie where its own intrinsics have them, or else on
+the rays of the data set's camera. Only sensors with a calibration of their own (ScanNet) are looked up ray by ray.
 """
 
 from collections.abc import Mapping, Sequence
@@ -56,17 +54,16 @@ NUM_PAIRS, PAIR_GAP = 5, 5  # of views that are compared, and how many frames ap
 
 
 class Files(Prior):
-    """A prior that reads its answers from files.
+    """A prior that reads its predictions from files.
 
     Args:
-        folder: of one of the layouts that docs/predictions.md lists, or an .npz with all images.
-        scale: `metric`, `arbitrary` (right up to one factor), or `auto`: what the layout is known to be.
-        median_depth: m, of the first view where the scale is arbitrary.
-        depth_scale: units of a metre in 16-bit .png files.
+        folder: in a layout of docs/predictions.md, or an .npz with all images.
+        scale: `metric`, `arbitrary` (up to one factor), or `auto`: as known of the layout.
+        median_depth: m, of the first view if the scale is arbitrary.
+        depth_scale: raw units a metre in 16-bit .png files.
         max_depth_step: relative depth difference across which nothing is interpolated.
-        pose_std: of every pose, a length in the files' unit and degrees; None: not known; `auto`: as the images say,
-            see `pose_angle`.
-        max_misfit: by which the depths of two views may differ, median.
+        pose_std: of every pose, (length in the files' unit, degrees); None: unknown; `auto`: see `pose_angle`.
+        max_misfit: largest median difference of the depths of two views.
     """
 
     def __init__(
@@ -102,7 +99,7 @@ class Files(Prior):
         self.provenance = Provenance("files", settings)
 
     def check(self, dataset: Dataset, window_size: int) -> None:
-        """Say what was found; ValueError where it does not fit the data set or itself."""
+        """Match files with frames, check that they fit, and describe them; ValueError if they do not."""
         found = self._found
         remedy = "predict it, write one whose T_world_camera is nan"
         self._rows = rows_of(dataset, found.names, self.folder, found.may_lack, remedy)
@@ -139,7 +136,7 @@ class Files(Prior):
         )
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
-        """Predict a window from the files of its views; `check` comes first, as it matches files with frames."""
+        """Predict a window from the files of its views, after `check` has matched them."""
         if not self._rows:
             raise ValueError("Files.check(dataset, window_size) finds which file is of which frame: call it first")
         size = frames[0].image.shape[1::-1]
@@ -154,14 +151,14 @@ class Files(Prior):
         return predicted(window, T_anchor_view, [*self._points.values()], pose_covariance=covariance)
 
     def _pose(self, index: int) -> np.ndarray:
-        """T_world_camera of a frame, NaN where it has none."""
+        """T_world_camera of a frame, or NaN."""
         row = self._rows[index]
         pose = np.full((4, 4), np.nan) if row is None else self._found.poses[row].copy()
         pose[:3, 3] *= self._factor
         return pose
 
     def _at_frame(self, index: int, camera: Camera) -> DenseView:
-        """Points, confidence and mask of a frame; without a pose or a file none can be used."""
+        """Points, confidence and mask of a frame; none is valid without a pose or a file."""
         row = self._rows[index]
         if row is None or not np.isfinite(self._found.poses[row]).all():
             return no_points(camera.size)
@@ -170,7 +167,7 @@ class Files(Prior):
         return points * np.float32(self._factor), confidence, mask
 
     def _first_depth(self) -> tuple[View, float]:
-        """The first view that has a depth, and its median."""
+        """The first view with a depth, and its median."""
         for row in range(len(self._found.names)):
             view = self._found.read(row)
             depth = view.geometry if view.geometry.ndim == 2 else view.geometry[..., 2]
@@ -179,7 +176,7 @@ class Files(Prior):
         raise ValueError(f"{self.folder}: none of its {len(self._found.names)} files has a depth above 0")
 
     def _pairs(self, known: list[int], camera: Camera, gap: int = PAIR_GAP) -> list[tuple[Sight, Sight]]:
-        """Views with a pose, some frames apart, from all of the sequence."""
+        """Pairs of views with a pose, `gap` apart, evenly spread."""
         known = [index for index in known if np.isfinite(self._pose(index)).all()]
         places = np.linspace(0, max(len(known) - 1 - gap, 0), NUM_PAIRS).astype(int)
         chosen = {(known[place], known[min(place + gap, len(known) - 1)]) for place in places}
@@ -191,7 +188,7 @@ class Files(Prior):
 
 
 def read_predictions(folder: Path, units_per_metre: float) -> Predictions:
-    """Read the predictions in a folder; the layout follows from the files that are there."""
+    """Read the predictions in a folder, in the layout that its files tell."""
     if not folder.exists():
         raise ValueError(f"prior.folder={folder} does not exist: give the folder of predictions (docs/predictions.md)")
     export = find_export(folder)
@@ -209,9 +206,9 @@ def read_predictions(folder: Path, units_per_metre: float) -> Predictions:
 
 
 def image_intrinsics(folder: Path, size: Size) -> Intrinsics | None:
-    """The camera of images of a size, which predictions of them hold: the median of `NUM_CAMERAS` views, evenly spread.
+    """The median camera of `NUM_CAMERAS` predictions, for images of a size.
 
-    None where they hold none, do not show the images, or are a sensor's with another camera.
+    None if they have none, do not show the images, or are of a sensor with another camera.
     """
     (width, height), longest = size, float(max(size))
     camera, found = Camera(size, (longest, longest, (width - 1) / 2, (height - 1) / 2)), []
@@ -238,7 +235,7 @@ def _pose_note(pose_std: tuple[float, float] | None) -> str:
 
 
 def _focal_note(view: View, camera: Camera, found: Predictions) -> str:
-    """Words where the intrinsics of a file are not those of the data set; ValueError where they cannot be."""
+    """Describe a difference between a file's intrinsics and the data set's; ValueError if it is too large."""
     if view.intrinsics is None:
         return ""
     expected = grid_intrinsics(camera, found.place(camera, view))
@@ -254,7 +251,7 @@ def _focal_note(view: View, camera: Camera, found: Predictions) -> str:
 
 
 def turned_files(dataset: Dataset) -> dict[int, Path]:
-    """The first image of each EXIF orientation that dataset=images turns, as not all programs do."""
+    """The first image of each EXIF orientation that dataset=images turns, which not all programs do."""
     if dataset.name != "images":
         return {}
     files = [file for index in range(len(dataset)) for file in dataset.files(index)[:1]]
@@ -273,7 +270,7 @@ def _turned_note(turned: Mapping[int, Path]) -> str:
 def _stored_words(
     dataset: Dataset, poses: Mapping[int, np.ndarray], turned: Mapping[int, Path], angle: float
 ) -> str | None:
-    """Words where poses that err by `angle` fit much better as those of the pixels as they are stored."""
+    """Describe that poses with the error `angle` fit the stored, unturned pixels much better; None if they do not."""
     if len(turned) != 1 or (turn := [*turned][0]) not in TURNS:
         return None
     upright = np.eye(4)

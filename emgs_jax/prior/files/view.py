@@ -1,4 +1,4 @@
-"""One frame's prediction as a file has it, and its points at the pixels of the frame."""
+"""A frame's prediction in a file, and its points at the frame's pixels."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -20,18 +20,12 @@ LEAST_DEPTH = 1e-6  # below: no value
 
 @dataclass(frozen=True)
 class View:
-    """Prediction of one frame as its file holds it, on a grid (gh, gw) of its own.
-
-    Args:
-        geometry: depths (camera-space z) (gh, gw), or points (gh, gw, 3) of the camera; 0 or not finite = no value.
-        confidence: (gh, gw), at least 1; None = all alike.
-        intrinsics: fx, fy, cx, cy of the grid; None = those of the frames.
-    """
+    """Prediction of one frame on its file's own grid (gh, gw)."""
 
     source: str
-    geometry: np.ndarray
-    confidence: np.ndarray | None = None
-    intrinsics: Intrinsics | None = None
+    geometry: np.ndarray  # depths (gh, gw) or points (gh, gw, 3) of the camera; 0 or not finite = no value
+    confidence: np.ndarray | None = None  # (gh, gw), at least 1; None: 1
+    intrinsics: Intrinsics | None = None  # fx, fy, cx, cy of the grid; None: those of the frames
 
     @property
     def grid(self) -> Size:
@@ -47,13 +41,13 @@ class Camera(NamedTuple):
 
     @property
     def aspect(self) -> float:
-        """Of the image as it was taken, whose pixels are square, however the frames are resized."""
+        """Aspect of the image as it was taken, with square pixels."""
         (width, height), (fx, fy, *_) = self.size, self.intrinsics
         return width * fy / (height * fx)
 
 
 class Part(NamedTuple):
-    """Part of the image that a grid shows: size of the image in the grid's pixels, and the grid's corner in it."""
+    """Part of the image that a grid shows: the image's size in the grid's pixels, and the grid's corner in it."""
 
     scaled: tuple[float, float]
     corner: tuple[float, float]
@@ -64,31 +58,22 @@ Place = Callable[[Camera, View], Part]
 
 @dataclass(frozen=True)
 class Predictions:
-    """Predictions that a folder holds.
-
-    Args:
-        names: of each view: the stem of its image's name, or its own.
-        poses: T_world_camera (n, 4, 4), NaN where it is not known.
-        pose_source: file and key of the poses, for messages.
-        may_lack: a frame without a view is one that the program could not solve.
-        unread: names of arrays in the first file that nothing is taken of.
-        place: what the grids show of the image.
-    """
+    """Predictions that a folder holds."""
 
     layout: str
-    names: list[str]
-    poses: np.ndarray
-    pose_source: str
+    names: list[str]  # of the views: stems of their images' names, or their own
+    poses: np.ndarray  # T_world_camera (n, 4, 4), NaN where unknown
+    pose_source: str  # file and key of the poses, for messages
     read: Callable[[int], View]
     files: list[Path]
     is_metric: bool
-    place: Place
-    may_lack: bool = False
-    unread: tuple[str, ...] = ()
+    place: Place  # the part of the image that grids show
+    may_lack: bool = False  # frames without a view are allowed
+    unread: tuple[str, ...] = ()  # arrays of the first file that are not used
 
 
 def whole_image(camera: Camera, view: View) -> Part:
-    """Of a grid that shows the whole image, whatever its size; ValueError where its sides say that it does not."""
+    """The part of a grid that shows the whole image at any size; ValueError if its aspect differs."""
     width, height = view.grid
     if abs(math.log(width / height / camera.aspect)) > MAX_ASPECT_ERROR:
         raise ValueError(
@@ -99,7 +84,7 @@ def whole_image(camera: Camera, view: View) -> Part:
 
 
 def by_rays(camera: Camera, view: View) -> Part:
-    """Of a sensor with a calibration of its own, at the place of the camera: a pixel is where its ray is."""
+    """The part of a sensor with its own calibration at the camera's place: pixels are matched by rays."""
     assert view.intrinsics is not None
     (width, height), (fx, fy, cx, cy) = camera.size, view.intrinsics
     x, y = fx / camera.intrinsics[0], fy / camera.intrinsics[1]
@@ -110,11 +95,7 @@ def by_rays(camera: Camera, view: View) -> Part:
 def at_frame(
     view: View, camera: Camera, place: Place, max_depth_step: float
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Points, confidence and mask of a view at every pixel of the frame, see `resize.at_pixels`.
-
-    The points lie where the view's own calibration has them, at the pixel that shows the same of the image. ValueError
-    where the view does not show what it should.
-    """
+    """Resample a view at the frame's pixels, see `resize.at_pixels`; points lie where its own calibration has them."""
     scaled, corner = place(camera, view)
     mask = usable(view.geometry)
     confidence = np.ones(mask.shape) if view.confidence is None else view.confidence
@@ -126,7 +107,7 @@ def at_frame(
 
 
 def usable(geometry: Float[np.ndarray, "gh gw *c"]) -> Bool[np.ndarray, "gh gw"]:
-    """Mark the pixels with a depth or a point: finite, and at least LEAST_DEPTH before the camera."""
+    """Mark the pixels with a finite depth or point, at least LEAST_DEPTH before the camera."""
     depth = geometry if geometry.ndim == 2 else geometry[..., 2]
     with np.errstate(invalid="ignore"):
         is_before = depth > LEAST_DEPTH
@@ -134,7 +115,7 @@ def usable(geometry: Float[np.ndarray, "gh gw *c"]) -> Bool[np.ndarray, "gh gw"]
 
 
 def grid_intrinsics(camera: Camera, part: Part) -> Intrinsics:
-    """fx, fy, cx, cy of a grid that has the rays of the frames."""
+    """fx, fy, cx, cy of a grid with the frames' rays."""
     (x, y), (left, top) = (length / size for length, size in zip(part.scaled, camera.size, strict=True)), part.corner
     fx, fy, cx, cy = camera.intrinsics
     return fx * x, fy * y, (cx + 0.5) * x - 0.5 - left, (cy + 0.5) * y - 0.5 - top
