@@ -175,10 +175,9 @@ def _write_tables(out: Path, jobs: Sequence[Job], failures: Mapping[str, str]) -
     done = {item.folder for item in estimates}
     missing = {job.name: failures.get(job.name, "to do") for job in jobs if job.folder not in done}
     quoted = published("reconstruction")
-    parts, shown = [paper_table(totals, quoted)], [*rows, *(row for row in totals if len(row.sequences) > 1)]
-    parts.append(full_table(shown) if rows else "")
-    parts.append("".join(f"- not finished: {name}: {reason}\n" for name, reason in missing.items()))
-    text = "\n".join(part for part in parts if part)
+    shown = [*rows, *(row for row in totals if len(row.sequences) > 1)]
+    unfinished = "".join(f"- not finished: {name}: {reason}\n" for name, reason in missing.items())
+    text = "\n".join(filter(None, [paper_table(totals, quoted), full_table(shown) if rows else "", unfinished]))
     out.mkdir(parents=True, exist_ok=True)
     for name, content in (("results.csv", to_csv(estimates)), ("results.md", text)):
         write_file(out / name, content)

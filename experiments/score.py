@@ -53,11 +53,7 @@ def score(config: DictConfig) -> tuple[Metrics, Path]:
 def matched_poses(
     path: str, dataset: ReadableFrames, max_difference: float, min_percent: float
 ) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """Poses of a file and true poses of the same times (n, 4, 4), in order of time, and the number of each.
-
-    Raises:
-        ValueError: fewer than `min_percent` of either have a partner, so the times are not those of the frames.
-    """
+    """Poses of a file and true poses of the same times (n, 4, 4), and the number of each; ValueError if few match."""
     if not Path(path).is_file():
         raise FileNotFoundError(f"trajectory={path} is no file: give a file with `timestamp tx ty tz qx qy qz qw`")
     times, poses = load_trajectory_tum(path)

@@ -15,11 +15,7 @@ SECONDS = 3.0  # for an image, from COLMAP to the report, on one core of a lapto
 
 
 def with_source(arguments: list[str]) -> list[str]:
-    """Replace a path among the arguments of `emgs run` by the keys that it implies, and print them.
-
-    Raises:
-        ValueError: the path does not exist, or there are several.
-    """
+    """Replace the path among the arguments of `emgs run`, if any, by the keys that it implies, and print them."""
     words = [word for word in words_of(arguments).overrides if "=" not in word]
     paths = [word for word in words if word[0] != "~" or word.startswith("~/")]  # ~KEY removes a key
     if not paths:

@@ -59,12 +59,7 @@ NO_WORD = (ValueError, TypeError, AssertionError)  # raised by Hydra if an optio
 
 
 def build(config: DictConfig, key: str, **more: Any) -> Any:
-    """Check all values of the node at a dotted `key` and instantiate it.
-
-    Raises:
-        ValueError: a value is not of the type or in the range that its field declares, a key is no parameter, or one is
-            missing.
-    """
+    """Check the values of the node at a dotted `key` and instantiate it; ValueError for wrong values and wrong keys."""
     if not isinstance(OmegaConf.select(config, key), DictConfig):
         raise ValueError(f"{key}={OmegaConf.select(config, key)} would stand in the place of all its keys")
     check_values(config, key)

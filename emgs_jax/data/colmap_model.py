@@ -66,11 +66,7 @@ def is_model(folder: Path) -> bool:
 
 
 def load_colmap(folder: Path) -> SparseModel:
-    """Read the cameras and images of a model, from binary files if they exist, as COLMAP does, else from text.
-
-    Raises:
-        ValueError: a line or a record is damaged, no image has a pose, or an image has no camera or exists twice.
-    """
+    """Read a model, from binary files if they exist, as COLMAP does, else from text; ValueError if it is damaged."""
     is_binary = all((folder / name).is_file() for name in BINARY)
     cameras_file, images_file = (folder / name for name in (BINARY if is_binary else TEXT))
     cameras, images = load_cameras(cameras_file), (_binary_images if is_binary else _text_images)(images_file)

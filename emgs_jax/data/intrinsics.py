@@ -192,11 +192,7 @@ def check_image_size(camera: Calibration, size: Size, what: str) -> None:
 
 
 def check_plausible(camera: Calibration, size: Size, what: str, images: str) -> str | None:
-    """Describe what is implausible in a camera for images of that size, or None.
-
-    Raises:
-        ValueError: no lens has such a view; or the numbers fit otherwise, and no size comes with them.
-    """
+    """Describe what is implausible in a camera, or None; ValueError if it is impossible, or likely of another form."""
     found = oddities(camera.intrinsics, size)
     if not found:
         return None

@@ -258,13 +258,6 @@ def other_kind(data: bytes) -> str | None:
     return "a web page" if data.lstrip()[:1] == b"<" else None
 
 
-def read_color(path: Path, raw_size: Size | None = None, flags: int = 0) -> UInt8[np.ndarray, "_ _ 3"]:
-    """Read an RGB image, turned by its EXIF unless `flags` has AS_STORED; BadFrameError unless it has `raw_size`."""
-    image = decode(path, cv2.IMREAD_COLOR | flags)
-    check_raw_size(image, raw_size, path)
-    return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-
-
 def read_depth(path: Path, depth_scale: float, raw_size: Size | None = None) -> Float32[np.ndarray, "_ _"]:
     """Read depth in metres from a 16-bit image, 0 = no value (raw 0 and 65535)."""
     raw = decode(path, cv2.IMREAD_UNCHANGED)

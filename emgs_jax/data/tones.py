@@ -4,6 +4,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+import cv2
 import numpy as np
 from jaxtyping import UInt8
 
@@ -71,9 +72,7 @@ def tones_of(files: Sequence[Path]) -> Tones | None:
 def read_shown(
     path: Path, raw_size: reading.Size | None, tones: Tones | None, flags: int = 0
 ) -> UInt8[np.ndarray, "_ _ 3"]:
-    """As `reading.read_color`, of an image that may have more than 8 bits."""
-    if tones is None:
-        return reading.read_color(path, raw_size, flags)
-    image = reading.decode(path, reading.OWN_BITS | flags)
+    """Read an RGB image, turned by its EXIF unless `flags` has AS_STORED; BadFrameError unless it has `raw_size`."""
+    image = reading.decode(path, flags | (cv2.IMREAD_COLOR if tones is None else reading.OWN_BITS))
     reading.check_raw_size(image, raw_size, path)
-    return np.ascontiguousarray(tones.shown(image)[..., ::-1])
+    return cv2.cvtColor(image if tones is None else tones.shown(image), cv2.COLOR_BGR2RGB)

@@ -18,10 +18,9 @@ Maps = tuple[np.ndarray, np.ndarray]  # for cv2.remap: column and row on disk of
 
 
 def undistortion(camera: Calibration, size: Size, what: str = "dataset.intrinsics") -> tuple[Intrinsics, Maps, float]:
-    """Intrinsics whose view lies within the distorted image, tables for cv2.remap, and the share of the image seen.
+    """Intrinsics of a view within the distorted image, tables for cv2.remap, and the share of the image seen.
 
-    Raises:
-        ValueError: the coefficients fold the image, or leave less than MIN_VIEW of it.
+    ValueError if the coefficients fold the image, or leave less than MIN_VIEW of it.
     """
     lens, share = to_pycolmap(camera, size), 0.0
     scale = _scale(camera.intrinsics, _reach(lens, size), size)

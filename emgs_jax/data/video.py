@@ -15,7 +15,7 @@ MIN_ASPECT = 0.2  # of a pixel; less means a damaged header
 
 
 class Video:
-    """A video, read from its beginning up to frame `stop`, as seeking lands on a nearby key frame with many codecs.
+    """A video up to frame `stop`, read from its beginning, as seeking lands on a nearby key frame with many codecs.
 
     `times` are the seconds of each readable frame; `notes` describe a wrong header and pixels that are not square.
     """

@@ -146,9 +146,7 @@ class SpooledRows:
     def by_ranges(self, voxel: float, read: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]) -> Iterator:
         """Yield the rows by ranges of cells, about `PART_ROWS` rows at a time, in the order in which they were added.
 
-        Args:
-            voxel: side of a cell.
-            read: maps rows that were added together to the numbers of their cells, and to what is yielded of them.
+        `read` maps rows that were added together to the numbers of their cells, and to what is yielded of them.
         """
         numbers, num_parts = np.sort(cell_numbers(np.concatenate(self._some), voxel)), -(-len(self) // PART_ROWS)
         edges = numbers[len(numbers) * np.arange(1, num_parts) // max(num_parts, 1)]

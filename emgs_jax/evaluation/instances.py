@@ -54,9 +54,7 @@ def find_instances(
 ) -> list[Instance]:
     """Cluster the Gaussians that answer to a word (rows `answers`), the largest sum of cosines first.
 
-    Args:
-        shape: means (n, 3) and covariances (n, 3, 3) of all Gaussians.
-        strength: their cosines and leads (n,).
+    Of all Gaussians, `shape` has means (n, 3) and covariances (n, 3, 3), `strength` cosines and leads (n,).
     """
     means, covs = (np.asarray(values, np.float64) for values in shape)
     cosines, leads = (np.asarray(values, np.float64) for values in strength)

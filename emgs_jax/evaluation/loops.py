@@ -26,9 +26,7 @@ def loop_metrics(
     least `min_gap` frames older, and is found if a right loop begins within 10 frames of it. It does not count if only
     loops without truth begin there, such as those into a saved map.
 
-    Args:
-        loops: frames a and b and the measured pose of camera b in camera a, metres, (4, 4).
-        truth: T_world_camera (4, 4) of every frame; None where unknown.
+    A loop is frames a and b and the pose (4, 4) of camera b in camera a; `truth` is T_world_camera or None.
     """
     judged = [loop for loop in loops if truth[loop[0]] is not None and truth[loop[1]] is not None]
     right = [b for a, b, measured in judged if _is_right(measured, truth[a], truth[b])]
@@ -72,9 +70,7 @@ def double_wall_share(
     along the normal between two standard deviations and 15 cm away, or four spacings without a metre. True surfaces so
     close behind another count too: compare maps of one scene.
 
-    Args:
-        means: (n, 3) in any unit, with unit normals (n, 3) and covariances (n, 3, 3).
-        metre: in that unit; None if unknown.
+    Lengths are in any unit; `metre` is one metre in it, None if unknown.
     """
     if len(means) < 2:
         return None

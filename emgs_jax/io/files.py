@@ -144,12 +144,12 @@ def write_json(path: str | os.PathLike, value: Any) -> None:
     write_file(path, json.dumps(jsonable(value), indent=2, allow_nan=False) + "\n")
 
 
-class FrameLog:
+class FrameLog(contextlib.AbstractContextManager):
     """A new JSON-lines file. Every line is complete: one that does not fit on the disk is cut off again."""
 
     def __init__(self, path: str | os.PathLike):
         self.path = Path(path)
-        self._file = open(self.path, "wb", buffering=0)  # noqa: SIM115 (closed by close or by the with statement)
+        self._file = open(self.path, "wb", buffering=0)  # noqa: SIM115 (closed by the with statement)
 
     def append(self, record: Mapping[str, Any]) -> None:
         line = (json.dumps(jsonable(record), allow_nan=False) + "\n").encode()
@@ -162,14 +162,8 @@ class FrameLog:
             self._file.seek(start)
             raise _named(error, self.path) from error
 
-    def close(self) -> None:
-        self._file.close()
-
-    def __enter__(self) -> "FrameLog":
-        return self
-
     def __exit__(self, *_: object) -> None:
-        self.close()
+        self._file.close()
 
 
 def _named(error: OSError, path: Path) -> OSError:

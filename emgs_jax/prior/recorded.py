@@ -152,12 +152,7 @@ def add_visits(folder: Path, prediction: PriorPrediction) -> None:
 
 
 class Recorded(Prior):
-    """A prior that replays a complete recording.
-
-    Args:
-        folder: written by `record`.
-        pose_std: of every pose, (length in the recording's unit, degrees), in place of recorded covariances.
-    """
+    """A prior that replays a complete recording; `pose_std`, (length, degrees), replaces the recorded covariances."""
 
     def __init__(self, folder: Path | str, pose_std: Sequence[float] | None = None) -> None:
         self.folder, self._pose_std = Path(folder), check_pose_std(pose_std)

@@ -33,11 +33,7 @@ class Shots(NamedTuple):
 
 
 def map_images(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
-    """COLMAP's models of the images, the largest first; `folder` keeps the database, to resume from.
-
-    Raises:
-        ValueError: the images do not determine a structure; with the reason and a remedy.
-    """
+    """Reconstruct models, the largest first, with a database in `folder`; ValueError, with a reason, if it fails."""
     folder.mkdir(parents=True, exist_ok=True)
     _say(shots, config)
     detect(shots, config, folder)

@@ -11,6 +11,7 @@ from emgs_jax.data import reading
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.file_names import natural_key
+from emgs_jax.data.tones import read_shown
 
 RAMP = np.stack([*np.meshgrid(np.arange(64), np.arange(48)), np.zeros((48, 64))], axis=-1).astype(np.uint8)
 
@@ -72,21 +73,21 @@ def test_start_stop_and_stride_are_a_slice():
 def test_every_truncation_of_an_image_is_found_and_named(suffix, tmp_path):
     data, path = encode(suffix), tmp_path / f"cut{suffix}"
     path.write_bytes(data)
-    assert reading.read_color(path, (64, 48)).shape == (48, 64, 3)
+    assert read_shown(path, (64, 48), None).shape == (48, 64, 3)
     for length in [*range(0, len(data) - 2, max(1, len(data) // 60)), len(data) - 1]:
         path.write_bytes(data[:length])
         with pytest.raises(BadFrameError, match=path.name):
-            reading.read_color(path)
+            read_shown(path, None, None)
 
 
 def test_a_truncated_jpeg_is_found_behind_a_whole_thumbnail(tmp_path):
     thumbnail, data, path = encode(".jpg", RAMP[:8, :8]), encode(".jpg"), tmp_path / "exif.jpg"
     data = data[:2] + b"\xff\xe1" + struct.pack(">H", len(thumbnail) + 2) + thumbnail + data[2:]
     path.write_bytes(data)
-    np.testing.assert_array_equal(reading.read_color(path), cv2.imread(str(path))[..., ::-1])
+    np.testing.assert_array_equal(read_shown(path, None, None), cv2.imread(str(path))[..., ::-1])
     path.write_bytes(data[:-200])
     with pytest.raises(BadFrameError, match="truncated"):
-        reading.read_color(path)
+        read_shown(path, None, None)
 
 
 def test_depth_is_metres_with_both_marks_of_the_sensor_zero_and_what_is_no_depth_image_is_refused(tmp_path):

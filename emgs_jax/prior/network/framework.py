@@ -59,12 +59,10 @@ class ViewOutput:
 def build_views(
     images: Sequence[np.ndarray], intrinsics: Sequence[float], resize: Resize, anchor_is_metric: bool | None
 ) -> list[View]:
-    """Make the framework's views from RGB images, uint8, on its grid; the first is the anchor.
+    """Make the framework's views from RGB images, uint8, on its grid; `intrinsics` are of the frames before `resize`.
 
-    Args:
-        intrinsics: fx, fy, cx, cy of the frames, before `resize`.
-        anchor_is_metric: give the anchor a pose and call it metric or not; None: no pose. Its value, the identity, has
-            no influence, as the network's poses are relative to the first view.
+    The first view is the anchor: it gets a pose, called metric or not, unless `anchor_is_metric` is None. The pose's
+    value has no influence, as the network's poses are relative to the first view.
     """
     matrix, views = resize_intrinsics(intrinsics, resize)[None], []
     for image in images:

@@ -11,7 +11,6 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from statistics import median
 from time import perf_counter
-from typing import Any
 
 import numpy as np
 
@@ -70,19 +69,17 @@ class MapAnything(Prior):
         self._anchor_is_metric = bool(anchor_is_metric) if anchor_pose in (True, "on") else None
         self._network = load(None if checkpoint is None else Path(checkpoint).expanduser(), compute)
         self._seconds: list[float] = []
-        self.provenance = Provenance("mapanything", self._settings(compute) | self._network.described)
-
-    def _settings(self, compute: ComputeConfig) -> dict[str, Any]:
-        return {
+        settings = {
             "version": 2,
             "anchor_pose": self._anchor_is_metric is not None,
             "anchor_is_metric": self._anchor_is_metric,
             "resolution": self._resolution,
             "max_depth_step": self._max_depth_step,
-            "masks": {name: float(value) for name, value in vars(self._masks).items()},
+            "masks": {name: float(value) for name, value in vars(masks).items()},
             "memory_efficient": compute.memory_efficient,
             "minibatch_size": compute.minibatch_size,
         }
+        self.provenance = Provenance("mapanything", settings | self._network.described)
 
     def report(self) -> dict[str, float]:
         """Number of inferences, their seconds (median, first) and peak GPU memory; nothing before the first."""

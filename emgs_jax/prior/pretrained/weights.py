@@ -23,9 +23,7 @@ def load_network(
 ) -> Network:
     """Load a network from a file with this SHA-256, as published at `source`; ValueError if it is missing or another.
 
-    Args:
-        key: of the tensors in what was saved; None: at the top.
-        build: makes the network of its tensors; KeyError names a missing one.
+    `key` is that of the tensors in what was saved (None: at the top); `build` makes the network of them.
     """
     if checkpoint is None or not Path(checkpoint).expanduser().is_file():
         raise ValueError(f"prior.dense.checkpoint={checkpoint} is no file: give the path of {source}")
