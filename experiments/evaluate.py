@@ -114,10 +114,10 @@ def evaluate(settings: Mapping[str, Any], command_line: str = "") -> list[str]:
     open_jobs = [job for job in ours if not _is_finished(job)]
     finished, now = [job for job in jobs if (job.folder / METRICS_FILE).is_file()], code_now()
     if older := [job.name for job in finished if code_of(read_metrics(job.folder / METRICS_FILE)["provenance"]) != now]:
-        said = f"results of other code are there, {len(older)} of {len(jobs)} ({older[0]}{', …' * (len(older) > 1)})"
+        said = f"{len(older)} of {len(jobs)} results are of other code ({older[0]}{', …' * (len(older) > 1)})"
         if baseline:
-            raise ValueError(f"{said}, and a gate is about what runs now: choose another out=FOLDER, or move them away")
-        print(f"{said}: they are not made anew (move them away for that)")
+            raise ValueError(f"{said}, and a gate needs the current code: choose another out=FOLDER, or move them away")
+        print(f"{said}: they are kept (move them away to compute them again)")
     print(f"shard {part}/{whole}: {len(open_jobs)} of its {len(ours)} jobs to do, {len(jobs)} in all")
     failures: dict[str, str] = {}
     try:

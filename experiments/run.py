@@ -152,7 +152,7 @@ def _map(
 ) -> tuple[MappingRun, RawPrior]:
     """Map all frames and log each; return the run and the raw predictions. An interrupted run writes what it has."""
     if keeper.found is not None:
-        tqdm.write(f"going on after frame {len(keeper.found.records)}: those before are read and predicted only")
+        tqdm.write(f"resuming after frame {len(keeper.found.records)}: earlier frames are only read and predicted")
     run, (baselines, evaluation, keeps_points) = start, compared
     with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
 
@@ -182,7 +182,7 @@ def _map(
                 if run.state is not None:
                     tqdm.write(f"ended early: what is mapped so far is in {folder}")
                 if keeper.path.exists():
-                    tqdm.write(f"the same command with hydra.run.dir={folder} goes on from there")
+                    tqdm.write(f"the same command with hydra.run.dir={folder} resumes there")
             raise
     if live is not None:
         live.show_last(run)

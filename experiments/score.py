@@ -87,7 +87,7 @@ def _check_twice(times: np.ndarray, poses: np.ndarray, path: str) -> None:
     differ = times[1:][(np.diff(times) == 0) & (poses[1:] != poses[:-1]).any((1, 2))]
     if len(differ):
         raise ValueError(
-            f"{path} has {len(differ)} poses at times at which it has another one, the first at {differ[0]:.6f} s: "
+            f"{path} has different poses with the same time, {len(differ)} of them, the first at {differ[0]:.6f} s: "
             "keep one path, with all digits of its times"
         )
 

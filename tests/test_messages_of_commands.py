@@ -249,7 +249,7 @@ OF_GATE = [
     (put("gate.yaml", "["), "is no baseline .*: write one with .* write_gate=FILE"),
     ({"shard": "1/2"}, "a gate needs the results of all jobs: run once more without shard"),
     ({"shard": "0/2", "gate": None}, r"such as (\d/\d), got"),
-    (of_other_code, "now: choose another out=FOLDER, or move them away"),
+    (of_other_code, "the current code: choose another out=FOLDER, or move them away"),
     ({"gate": None, "write_gate": "new.yaml", "rounded": "again"}, ": evaluate into it first"),
     (
         (evaluated(out="again"), {"gate": None, "write_gate": "new.yaml", "rounded": "again"}),

@@ -61,7 +61,7 @@ NO_WORD = (ValueError, TypeError, AssertionError)  # raised by Hydra if an optio
 def build(config: DictConfig, key: str, **more: Any) -> Any:
     """Check the values of the node at a dotted `key` and instantiate it; ValueError for wrong values and wrong keys."""
     if not isinstance(OmegaConf.select(config, key), DictConfig):
-        raise ValueError(f"{key}={OmegaConf.select(config, key)} would stand in the place of all its keys")
+        raise ValueError(f"{key}={OmegaConf.select(config, key)} would replace all of its keys")
     check_values(config, key)
     node = OmegaConf.select(config, key)
     try:
@@ -91,8 +91,8 @@ def compose(*overrides: str, name: str = "config") -> DictConfig:
         value = OmegaConf.select(config, group.replace("/", "."), default={})
         if not isinstance(value, Mapping | DictConfig):
             raise ValueError(
-                f"{group.replace('/', '.')}={value} would put a word in the place of all its keys: choose one of its "
-                f"options ({', '.join(options)}) with {group}={value if value in options else options[0]}"
+                f"{group.replace('/', '.')}={value} would replace all of its keys: choose one of its options "
+                f"({', '.join(options)}) with {group}={value if value in options else options[0]}"
             )
     return config
 

@@ -68,10 +68,10 @@ def check_value(key: str, value: Any, field: Declared) -> None:
         if value not in field.choices:
             raise ValueError(f"{key} must be one of {', '.join(field.choices)}; got {shown}")
     elif dataclasses.is_dataclass(field.hint):
-        raise ValueError(f"{key}={shown} would stand in the place of all its keys: give {key}.KEY=VALUE")
+        raise ValueError(f"{key}={shown} would replace all of its keys: give {key}.KEY=VALUE")
     elif not _fits(value, field.hint, field.range):
         raise ValueError(
-            f"{key} must be {' or '.join(_words(field))}, got {shown}: give such a value, or none for the default"
+            f"{key} must be {' or '.join(_words(field))}, got {shown}: give such a value, or leave the key out"
         )
 
 

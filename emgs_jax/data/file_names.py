@@ -108,8 +108,8 @@ def taken_note(paths: Sequence[Path]) -> str | None:
     if back is None:
         return None
     return (
-        f"{back[1]} comes after {back[0]} by its name and was taken before it, as EXIF says: where a counter began "
-        "anew or a clock was set back, rename the images in the order in which they were taken"
+        f"{back[1]} comes after {back[0]} by its name, but was taken before it by its EXIF: if a counter was reset or "
+        "a clock set back, rename the images in the order in which they were taken"
     )
 
 

@@ -314,8 +314,8 @@ def _transparency(path: Path) -> str | None:
     except (OSError, ValueError, SyntaxError):  # damaged; reported when it is read
         return None
     return (
-        f"{path.name} is transparent in places, and maybe others: what is there is mapped in the colour that the file "
-        "has below (often black): take such pixels out of the predictions"
+        f"{path.name} is transparent in places, and maybe others: such pixels are mapped in the file's colour below "
+        "(often black): take them out of the predictions"
     )
 
 

@@ -76,8 +76,8 @@ def read_rows(path: Path, images: list[Path]) -> list[str]:
     rows, last = [row for row in text.splitlines() if not row.lstrip().startswith("#")], max(map(number_of, images))
     if not all(map(str.strip, rows)) and last < sum(map(bool, map(str.strip, rows))):
         raise ValueError(
-            f"{path} has blank lines among its poses, so it is open which image those behind them are of: take the "
-            "lines out, or where an image has no pose write 16 times nan"
+            f"{path} has blank lines among its poses, so it is unclear which images the poses after them belong to: "
+            "remove the lines, or write 16 times nan for an image without a pose"
         )
     if last >= len(rows):
         raise ValueError(f"{path} has {len(rows)} poses, but there is an image number {last}: fetch traj.txt again")

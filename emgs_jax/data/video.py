@@ -34,7 +34,7 @@ class Video:
             (height, width), shown = self._decoded(0).shape[:2], self.read(0).shape[1]
             self.notes.append(
                 f"pixels of {path} are {self._aspect:.4g} times as wide as high: its {width}x{height} frames are shown "
-                f"as {shown}x{height}, and intrinsics are of these"
+                f"as {shown}x{height}, to which intrinsics refer"
             )
 
     def _nothing_decoded(self) -> str:

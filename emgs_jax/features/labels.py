@@ -104,7 +104,7 @@ def _check_shape(found: tuple[int, int], size: tuple[int, int], path: Path) -> N
     (w, h), (width, height) = found, size
     if abs(w * height - h * width) > max(w, h, width, height):
         raise BadFrameError(
-            f"{path} is {w}x{h}, which is not of the shape of the {width}x{height} frame: give whole ones"
+            f"{path} is {w}x{h}, which is not the aspect of the {width}x{height} frame: give labels of the whole image"
         )
     if min(w, h) * MAX_ENLARGED < min(width, height):
         raise BadFrameError(f"{path} is {w}x{h}, too coarse for a frame of {width}x{height}: give larger ones")

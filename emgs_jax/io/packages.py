@@ -41,7 +41,7 @@ def best_device(torch: ModuleType, what: str, key: str) -> str:
         return "cuda"
     print(
         f"warning: torch {torch.__version__} finds no GPU, so {what} runs on the CPU, which is slow "
-        f"({key}=cpu says that this is meant)",
+        f"({key}=cpu silences this)",
         file=sys.stderr,
     )
     return "cpu"

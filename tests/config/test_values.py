@@ -89,8 +89,8 @@ def test_intrinsics_are_numbers_that_a_name_may_precede():
         ),
         ("prior=multiview_stereo prior.dense.depth.max_cost=nan", "prior.dense.depth.max_cost must be a number"),
         ("baseline=voxel baseline.voxel.voxel_m=-1", "baseline.voxel.voxel_m must be a number"),
-        ("slam.em.average=3", "^slam.em.average=3 would stand in the place of all its keys: give slam.em.average.KEY="),
-        ("graph=default graph.noise=null", "^graph.noise=null would stand in the place of all its keys"),
+        ("slam.em.average=3", "^slam.em.average=3 would replace all of its keys: give slam.em.average.KEY="),
+        ("graph=default graph.noise=null", "^graph.noise=null would replace all of its keys"),
         ("evaluation.icp_voxel_m={}", "^evaluation.icp_voxel_m must be a number"),
         ("slam.em.support={}", "^slam.em.support must be one of printed, normalized"),
     ],
@@ -112,7 +112,7 @@ def test_a_config_and_a_run_check_before_anything_is_made():
         load_config(*TINY, "slam.em.noise=nan")
     with pytest.raises(ValueError, match=r"evaluation\.voxel_m must be"):
         build(compose("evaluation.voxel_m=nan"), "evaluation")
-    with pytest.raises(ValueError, match="^densify=2 would stand in the place of all its keys"):
+    with pytest.raises(ValueError, match="^densify=2 would replace all of its keys"):
         load_config(*TINY, "densify=2")
     with pytest.raises(ValueError, match=r"^render=\[\]: .*render"):
         load_config("render=[]")

@@ -76,7 +76,7 @@ def test_images_that_were_taken_in_another_order_than_their_names_have_are_told(
         exif = (image := Image.new("RGB", (8, 8))).getexif()
         exif.get_ifd(0x8769)[0x9003] = f"2026:11:27 14:22:{second}"
         image.save(path, exif=exif)
-    assert taken_note(paths).startswith("IMG_9998.jpg comes after IMG_0002.jpg by its name and was taken before it")
+    assert taken_note(paths).startswith("IMG_9998.jpg comes after IMG_0002.jpg by its name, but was taken before it")
     assert taken_note([*paths[2:], *paths[:2]]) is None
     Image.new("RGB", (8, 8)).save(paths[0])
     assert taken_note(paths[:1]) is None

@@ -84,7 +84,7 @@ def announcing(rows: int) -> bytes:
         (np.zeros((2, 4, 3)), r"must hold scores \(h, w, 2\)"),
         (np.full((2, 4, 2), np.nan), "not finite"),
         (np.full((2, 4, 2), -0.1), "negative"),
-        (np.zeros((4, 4, 2)), "not of the shape of the 4x2 frame"),
+        (np.zeros((4, 4, 2)), "not the aspect of the 4x2 frame"),
         (np.array([[["a", "b"]]]), "must hold scores"),
         (np.zeros((0, 0, 2)), "must hold scores"),
         (b"\x93NUMPY\x01\x00\x10", "is no array of scores, or damaged"),
@@ -123,7 +123,7 @@ def test_labels_that_do_not_fit_the_images_or_classes_are_named(folder):
     assert model.settings["unknown"] is None and model_of(folder, unknown=[0, 7]).settings["unknown"] == [0, 7]
     large = Frame(0, 0.0, "images/a.jpg", np.zeros((120, 160, 3), np.uint8))
     for shape, frame, message in (
-        ((4, 4), FRAME, r"a\.png is 4x4, which is not of the shape of the 4x2 frame"),
+        ((4, 4), FRAME, r"a\.png is 4x4, which is not the aspect of the 4x2 frame"),
         ((3, 4), large, r"a\.png is 4x3, too coarse for a frame of 160x120"),
     ):
         cv2.imwrite(str(folder / "a.png"), np.full(shape, 2, np.uint8))

@@ -149,7 +149,7 @@ def test_a_run_that_is_stopped_and_goes_on_has_the_same_bits(tmp_path, monkeypat
         experiments.run.run(compose(*OVERRIDES, *more), tmp_path)
     assert (tmp_path / CHECKPOINT_FILE).exists()
     goes_on(tmp_path, more, num_steps, monkeypatch)
-    assert "going on after frame" in "".join(capsys.readouterr())
+    assert "resuming after frame" in "".join(capsys.readouterr())
     if more == MOVING:  # what later frames said of an earlier one was known before the stop, and is afterwards
         assert [line["moving"] > 0 for line in log_lines(tmp_path)][:4].count(True) >= 2
 

@@ -62,7 +62,7 @@ pytestmark = pytest.mark.slow
         (["dataset=1.5"], "^dataset=1.5 is no option of dataset: there are apartment"),
         (["dataset=null"], "^dataset=null: Config group override must be a string"),
         (["graph=3"], "^graph=3 is no option of graph: there are default, none"),
-        (["slam.em=null"], r"^slam\.em=None would put a word in the place of all its keys: .* with slam/em=default$"),
+        (["slam.em=null"], r"^slam\.em=None would replace all of its keys: .* with slam/em=default$"),
         (["hydra=3"], "^hydra=3: "),
     ],
 )

@@ -188,9 +188,9 @@ def test_results_of_other_code_are_named_and_pass_no_gate(evaluate, tmp_path, ca
     metrics = json.loads(path.read_text())
     metrics["provenance"] |= other
     path.write_text(json.dumps(metrics))
-    with pytest.raises(ValueError, match=r"results of other code are there, 1 of 2 \(synthetic/1/default/0\), and a g"):
+    with pytest.raises(ValueError, match=r"1 of 2 results are of other code \(synthetic/1/default/0\), and a gate "):
         evaluate(f"gate={gate}")
-    assert evaluate() == [] and evaluate.runs == [] and "they are not made anew" in capsys.readouterr().out
+    assert evaluate() == [] and evaluate.runs == [] and "they are kept" in capsys.readouterr().out
     path.unlink()
     assert evaluate(f"gate={gate}") == [] and evaluate.runs == [(1, 0)]
 

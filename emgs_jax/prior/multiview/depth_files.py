@@ -101,8 +101,8 @@ def _load_png(path: Path, kind: str, depth_scale: float) -> np.ndarray:
     raw = decode(path, cv2.IMREAD_UNCHANGED)
     if raw.ndim == 3 and (raw[..., :3] != raw[..., :1]).any():
         raise ValueError(
-            f"{path} is a coloured picture of depth, which tells none: let the program write values (--grayscale "
-            "--pred-only, --save_npz, .npy)"
+            f"{path} is a coloured picture of depth, from which values cannot be read: let the program write values "
+            "(--grayscale --pred-only, --save_npz, .npy)"
         )
     raw = np.float32(raw[..., 0] if raw.ndim == 3 else raw)
     return raw / np.float32(depth_scale) if kind == "metric" else raw
