@@ -26,7 +26,7 @@ def segment(config: DictConfig) -> tuple[dict[str, Any], str]:
     """Score the maps of a config, and write results and table; return both."""
     counting = Counting(config.num_neighbours, tuple(config.ignored))
     how = Placement(config.alignment, config.with_scale, config.icp_distance_m, config.icp_max_steps)
-    runs = [read_run(Path(str(folder))) for folder in (config.map if _is_list(config.map) else [config.map])]
+    runs = [read_run(Path(folder)) for folder in _listed(config.map)]
     scenes = scene_names(config, runs)
     if len({(run.folder.resolve(), scene) for run, scene in zip(runs, scenes, strict=True)}) < len(runs):
         raise ValueError(f"map={config.map} names a folder twice, whose points would count twice: give each once")
@@ -51,7 +51,7 @@ def scene_names(config: DictConfig, runs: list[FinishedRun]) -> list[str]:
     """Names of the scenes: `scenes`, else the mapped sequences."""
     if config.scenes is None:
         return [str(run.provenance["data"]["sequence"]) for run in runs]
-    names = [str(name) for name in (config.scenes if _is_list(config.scenes) else [config.scenes])]
+    names = _listed(config.scenes)
     if len(names) != len(runs):
         raise ValueError(f"scenes has {len(names)} names and map {len(runs)} folders: give one name for each map")
     return names
@@ -82,8 +82,8 @@ def true_points(config: DictConfig, run: FinishedRun, scene: str) -> LabelledPoi
     return truth
 
 
-def _is_list(value: Any) -> bool:
-    return isinstance(value, ListConfig | list)
+def _listed(value: Any) -> list[str]:
+    return [str(one) for one in (value if isinstance(value, ListConfig | list) else [value])]
 
 
 @command("segment")

@@ -112,9 +112,9 @@ class MultiviewStereo(Prior):
             if structure.world[frame] == world:
                 T[row] = np.eye(4) if frame == anchor else T_anchor_world @ structure.T_world_camera[frame]
                 spread[row] = structure.covariance[frame]
-        dense = [self._answer(frame) for frame in window.dense]
-        known = {"pose_covariance": spread, "scale_std": self._scale_std(window.current), "world": world}
-        return predicted(window, T, dense, **known)
+        dense, current = [self._answer(frame) for frame in window.dense], window.current
+        scale_std = np.float64(self._depths(current).scale_std) if structure.is_placed[current] else None
+        return predicted(window, T, dense, pose_covariance=spread, scale_std=scale_std, world=world)
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
         """Predict for views of two visits of a place; None unless they are in one world."""
@@ -154,9 +154,6 @@ class MultiviewStereo(Prior):
         mask = depth > 0
         confidence = np.maximum(1.0 / np.where(mask, std, 1.0), np.float32(1.0))
         return points_shown(np.where(mask, depth, 0.0), lens), confidence, mask
-
-    def _scale_std(self, frame: int) -> np.float64 | None:
-        return np.float64(self._depths(frame).scale_std) if self._found.is_placed[frame] else None
 
     def _std(self, frame: int) -> np.ndarray:
         """Standard deviation of the log of each depth; inf where undetermined."""
