@@ -51,7 +51,7 @@ def test_the_scripts_import_each_other_by_relative_names_so_that_they_work_under
 
 def test_every_command_is_listed_with_an_example_and_an_unknown_one_is_named(monkeypatch, capsys):
     assert PROJECT["project"]["scripts"] == {"emgs": "emgs_jax.experiments.cli:main"}
-    programs = {path.stem for path in (ROOT / "experiments").glob("*.py") if "@command(" in path.read_text()}
+    programs = {path.stem for path in (ROOT / "experiments").glob("*.py") if 'command("' in path.read_text()}
     assert set(COMMANDS) == programs
     monkeypatch.setattr("sys.argv", ["emgs", "--help"])
     main()
