@@ -11,7 +11,7 @@ from .command import overrides_of, words_of
 
 NUM_PIXELS, SIDE = 320 * 240, 16  # of a frame, and what its sides are multiples of
 NUM_FRAMES = 150  # of a video: about as many are taken, evenly
-SECONDS = 3.0  # that an image takes, from COLMAP to the report, on one core of a laptop
+SECONDS = 5.0  # that an image takes, from COLMAP to the report, on one core
 
 
 def with_source(arguments: list[str]) -> list[str]:

@@ -11,7 +11,7 @@ import trimesh
 from jaxtyping import Float, Float32
 
 from emgs_jax.data import reading
-from emgs_jax.data.base import STAYS, Frame
+from emgs_jax.data.base import STAYS, Dataset, Frame
 from emgs_jax.data.furniture import Part
 from emgs_jax.data.looks import Looks, draw_looks, paint
 from emgs_jax.data.movers import Lane, Mover, build_movers
@@ -29,7 +29,7 @@ class Scene:
 
 
 @dataclass(eq=False)
-class RayCast:
+class RayCast(Dataset):
     """A data set whose frames are cast when they are asked for: each depends on its pose only, not on those before.
 
     A built-in scene is a subclass that names itself, its classes and its version, and says what to `_show`.

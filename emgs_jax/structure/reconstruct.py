@@ -33,6 +33,7 @@ class Shots(NamedTuple):
         camera: COLMAP's model and its parameters in COLMAP's pixels, "PINHOLE", (fx, fy, cx, cy); no parameters: its
             default focal length is where the calibration begins.
         is_calibrated: True where only the distortion may still change.
+        mask: what is left out of image 0 .. n-1, bool (h, w); None: nothing.
     """
 
     names: Sequence[str]
@@ -40,6 +41,7 @@ class Shots(NamedTuple):
     size: tuple[int, int]
     camera: tuple[str, tuple[float, ...]]
     is_calibrated: bool
+    mask: Callable[[int], np.ndarray | None] = lambda _: None
 
 
 def map_images(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
@@ -102,7 +104,7 @@ def detect(shots: Shots, config: StructureConfig, folder: Path) -> None:
         check_kinds(extraction.type.name, matcher_of(config).name)
     model, parameters = shots.camera
     reader = pycolmap.ImageReaderOptions(
-        camera_model=model, camera_params=",".join(map(repr, parameters)), mask_path=_masks(shots, config, folder)
+        camera_model=model, camera_params=",".join(map(repr, parameters)), mask_path=_masks(shots, folder)
     )
     names = [name for name in shots.names if f"{name}.png" not in done]
     number = {name: index for index, name in enumerate(shots.names)}
@@ -136,21 +138,18 @@ def _write(shots: Shots, index: int, images: Path) -> bool:
     return image.shape[1::-1] == tuple(shots.size) and cv2.imwrite(str(path), image[..., ::-1], FAST)
 
 
-def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
+def _masks(shots: Shots, folder: Path) -> str:
     """The folder of masks under the names that COLMAP looks for; '' without any.
 
     Raises:
-        ValueError: there are none, or one has another size than its image.
+        BadFrameError: one cannot be read, or has another size than its image.
     """
-    if config.masks.folder is None:
-        return ""
     own = folder / "masks"
-    config.masks.check(shots.names)
-    own.mkdir(exist_ok=True)
-    for name in shots.names:
-        mask = np.uint8(255 * ~config.masks.read(name, shots.size))
-        cv2.imwrite(str(own / f"{name}.png.png"), mask)
-    return str(own)
+    for index, name in enumerate(shots.names):
+        if (is_out := shots.mask(index)) is not None:
+            own.mkdir(exist_ok=True)
+            cv2.imwrite(str(own / f"{name}.png.png"), np.uint8(255 * ~is_out))
+    return str(own) if own.is_dir() else ""
 
 
 def matcher_of(config: StructureConfig) -> Any:

@@ -30,7 +30,8 @@ def structure_of(dataset: Dataset, config: StructureConfig, folder: Path | None)
     if key is not None and (models := models_of(key, folder)) is not None:
         return to_structure(models, names, config), True
     read, size, intrinsics = full_images(dataset)
-    shots = Shots(names, read, size, pinhole_of(intrinsics, config), is_calibrated=True)
+    masks = getattr(dataset, "full_mask", None)
+    shots = Shots(names, read, size, pinhole_of(intrinsics, config), is_calibrated=True, mask=masks)
     _, models = make_models(shots, config, folder)
     # A model that is given is of the images on disk, which the data set may have straightened.
     is_straight = config.model is not None and any(dataset.calibration.get("distortion") or ())
@@ -46,11 +47,13 @@ def calibrate(
     """
     if config.camera_model not in PERSPECTIVE:
         raise ValueError(f"prior.structure.camera_model={config.camera_model}: there are {', '.join(PERSPECTIVE)}")
-    names = image_names([*pictures.files] or [None] * pictures.count, pictures.numbers or range(pictures.count))
+    files, numbers = [*pictures.files] or [None] * pictures.count, pictures.numbers or range(pictures.count)
+    names, mask = image_names(files, numbers), config.masks.reader(files, numbers, pictures.size)
     (width, height), focal = pictures.size, _exif_focal(pictures)
     is_known = focal is not None and config.camera_model == "SIMPLE_RADIAL"
     start = (focal, width / 2, height / 2, 0.0) if is_known else ()
-    shots = Shots(names, pictures.read, pictures.size, (config.camera_model, start), is_calibrated=False)
+    camera = config.camera_model, start
+    shots = Shots(names, pictures.read, pictures.size, camera, is_calibrated=False, mask=mask)
     key, models = make_models(shots, config, folder)
     image = next(image for image in models[0].images.values() if image.has_pose)
     camera = from_colmap(image.camera.model_name, [*image.camera.params], pictures.size, "COLMAP's self-calibration")

@@ -23,6 +23,7 @@ from emgs_jax.structure.library import load
 from emgs_jax.structure.reconstruct import DATABASE, Shots, map_database, map_images
 
 ABOUT = "structure.json"
+VERSION = 1  # goes up with every change of `structure/` that makes other models of the same images
 NOT_OF_MODELS = ("model", "median_depth", "pixel_std", "max_gap")  # settings of what is made of the models
 PARTS = ("cameras", "images")
 CACHE = Path("~/.cache/emgs_jax/structure")
@@ -30,16 +31,18 @@ SQLITE = b"SQLite format 3\0"  # how its files begin
 
 
 def key_of(shots: Shots, config: StructureConfig) -> str:
-    """Hex digest of the images' pixels, the camera, the settings and COLMAP's version."""
+    """Hex digest of the pixels of images and masks, the camera, the settings, and the versions of COLMAP and ours."""
     settings = {name: value for name, value in asdict(config).items() if name not in NOT_OF_MODELS}
-    settings["masks"] = settings["masks"] if config.masks.folder is not None else None
-    about = [settings, shots.camera, shots.is_calibrated, [*shots.names], load().__version__]
+    settings["masks"] = config.masks.fingerprint()
+    about = [settings, shots.camera, shots.is_calibrated, [*shots.names], load().__version__, VERSION]
     digest = hashlib.blake2b(json.dumps(about, sort_keys=True, default=str).encode(), digest_size=16)
     for index in range(len(shots.names)):
         try:
             digest.update(np.ascontiguousarray(shots.read(index)).data)
         except BadFrameError:
             digest.update(b"none")
+        if not config.masks.folder and (is_out := shots.mask(index)) is not None:
+            digest.update(np.ascontiguousarray(is_out).data)
     return digest.hexdigest()
 
 
