@@ -108,7 +108,7 @@ class Masks:
                 "first one 000000.png (ffmpeg: -start_number 0)"
             )
 
-    def read(self, path: Path, size: tuple[int, int], image: Path | None = None) -> Bool[np.ndarray, "h w"]:
+    def decoded(self, path: Path, size: tuple[int, int], image: Path | None = None) -> Bool[np.ndarray, "h w"]:
         """What is left out of an image of (width, height) `size`, without the border.
 
         Args:
@@ -141,7 +141,11 @@ class Masks:
     ) -> Callable[[int], Bool[np.ndarray, "h w"] | None]:
         """A function that reads the mask of image 0 .. n-1, of `size` on disk, with the border; else as `files`."""
         files = self.files(images, numbers)
-        return lambda row: files[row] and self.fitted(self.read(files[row], size, images[row]), size)
+        return lambda row: files[row] and self.fitted(self.decoded(files[row], size, images[row]), size)
+
+    def read(self, name: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"] | None:
+        """What is left out of the image of this name and (width, height) `size`, with the border; as `reader`."""
+        return self.reader([Path(name)], [0], size)(0)
 
     def fingerprint(self) -> list[object]:
         """What the masks depend on: options, and the names and contents of files."""

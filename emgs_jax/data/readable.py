@@ -59,8 +59,7 @@ class ReadableFrames:
             first = next(iter(self.skipped.values()), "there are none")
             raise ValueError(f"{what} has no frame that can be read: {first}")
         _check_truth(dataset, self.kept)
-        some = self.kept[:: len(self.kept) // 5 + 1]
-        self.mask_note = _mask_note([self._left_out(index, self.size) for index in some])
+        self.mask_note = self._mask_note() if self.has_masks else None
 
     def __len__(self) -> int:
         return len(self.kept)
@@ -94,6 +93,14 @@ class ReadableFrames:
         """What is left out of `full`, bool (h, w); None without a mask."""
         return self._left_out(self.kept[index], self.size if self.full_intrinsics is None else self._dataset.raw_size)
 
+    def _mask_note(self) -> str:
+        """Say of how many frames there are masks, and how much some of these leave out."""
+        own = [index for index in self.kept if self._mask_files[index] is not None]
+        share = np.mean([self._left_out(index, self.size).mean() for index in own[:: len(own) // 5 + 1]])
+        note = f"masks of {len(own)} of {len(self.kept)} frames leave out {100 * share:.0f} % of the images"
+        advice = "black is left out, white is kept: if yours are white where something is to be left out, invert them"
+        return note if share <= MANY else f"{note}; {advice}"
+
     @staticmethod
     def _files_of_masks(dataset: Dataset, masks: Masks) -> list[tuple[Path, Path | None] | None]:
         """The mask and the image file of each frame of the data set; None where it has no mask."""
@@ -109,7 +116,7 @@ class ReadableFrames:
         if self._mask_files[index] is None:
             return None
         mask, image = self._mask_files[index]
-        is_out = self._masks.read(mask, self._dataset.raw_size, image)
+        is_out = self._masks.decoded(mask, self._dataset.raw_size, image)
         return self._masks.fitted(self._dataset.straight(is_out), size)
 
     def pose(self, index: int) -> np.ndarray | None:
@@ -136,17 +143,6 @@ def _unreadable(read: Callable[[int], Frame], indices: Iterable[int]) -> dict[in
         except BadFrameError as error:
             reasons[index] = str(error)
     return reasons
-
-
-def _mask_note(masks: Sequence[np.ndarray | None]) -> str | None:
-    """Say how much masks leave out, where it is most of the images."""
-    share = np.mean([mask.mean() for mask in masks if mask is not None] or [0.0])
-    if share <= MANY:
-        return None
-    return (
-        f"masks leave out {100 * share:.0f} % of the images: black is left out, white is kept; if yours are white "
-        "where something is to be left out, invert them"
-    )
 
 
 def _check_truth(dataset: Dataset, kept: Sequence[int]) -> None:

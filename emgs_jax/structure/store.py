@@ -18,12 +18,13 @@ from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.colmap_model import check_whole
 from emgs_jax.data.masks import stem
 from emgs_jax.io.files import write_file
+from emgs_jax.structure import reconstruct
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.library import load
 from emgs_jax.structure.reconstruct import DATABASE, Shots, map_database, map_images
 
 ABOUT = "structure.json"
-VERSION = 1  # goes up with every change of `structure/` that makes other models of the same images
+VERSION = 1  # goes up with every change of the code of `structure/` that makes other models of the same images
 NOT_OF_MODELS = ("model", "median_depth", "pixel_std", "max_gap")  # settings of what is made of the models
 PARTS = ("cameras", "images")
 CACHE = Path("~/.cache/emgs_jax/structure")
@@ -34,7 +35,7 @@ def key_of(shots: Shots, config: StructureConfig) -> str:
     """Hex digest of the pixels of images and masks, the camera, the settings, and the versions of COLMAP and ours."""
     settings = {name: value for name, value in asdict(config).items() if name not in NOT_OF_MODELS}
     settings["masks"] = config.masks.fingerprint()
-    about = [settings, shots.camera, shots.is_calibrated, [*shots.names], load().__version__, VERSION]
+    about = [settings, shots.camera, shots.is_calibrated, [*shots.names], load().__version__, VERSION, _constants()]
     digest = hashlib.blake2b(json.dumps(about, sort_keys=True, default=str).encode(), digest_size=16)
     for index in range(len(shots.names)):
         try:
@@ -44,6 +45,11 @@ def key_of(shots: Shots, config: StructureConfig) -> str:
         if not config.masks.folder and (is_out := shots.mask(index)) is not None:
             digest.update(np.ascontiguousarray(is_out).data)
     return digest.hexdigest()
+
+
+def _constants() -> dict[str, Any]:
+    """The numbers that models are made with, and nobody sets."""
+    return {name: value for name, value in vars(reconstruct).items() if name.isupper()}
 
 
 def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> tuple[str, list[Any]]:

@@ -38,7 +38,7 @@ def test_what_is_black_or_of_a_class_is_left_out_with_a_border(tmp_path, image, 
     names = {"names": str(tmp_path / "names.txt")} if "classes" in more else {}
     masks = Masks(str(written(tmp_path / "masks", ["a b"], image)), **more, **names)
     (path,) = masks.files([Path("images/a b.jpg")], [0])
-    is_out = masks.fitted(masks.read(path, (64, 48)), (64, 48))
+    is_out = masks.fitted(masks.decoded(path, (64, 48)), (64, 48))
     np.testing.assert_array_equal(is_out, np.indices((48, 64))[1] < columns)
 
 
