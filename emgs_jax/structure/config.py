@@ -40,7 +40,8 @@ class StructureConfig:
         options: further options by part (extraction, matching, verification, incremental, global), in pycolmap's words.
         min_inliers: of a frame that no model holds, registered in the end with fewer than the mapper asks for.
         max_gap: frames; one that is still without a pose is interpolated between neighbours so near, without points.
-        median_depth: of what a model's images show; its unit, since images do not tell the scale.
+        median_depth: of what a model's images show; its unit, since images do not tell the scale. A model that is
+            given keeps its own.
         pixel_std: least standard deviation of a keypoint; that of the residuals where it is larger.
     """
 

@@ -1,6 +1,6 @@
 """The structure of a data set's images, and the camera of images whose intrinsics nobody knows."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from emgs_jax.data.base import Dataset
-from emgs_jax.data.camera_models import PERSPECTIVE, Calibration, from_colmap
+from emgs_jax.data.camera_models import PERSPECTIVE, Calibration, from_colmap, to_pycolmap
 from emgs_jax.data.intrinsics import Pictures, from_exif
 from emgs_jax.data.masks import image_names, names_of
 from emgs_jax.structure.config import StructureConfig
@@ -30,11 +30,12 @@ def structure_of(dataset: Dataset, config: StructureConfig, folder: Path | None)
     if key is not None and (models := models_of(key, folder)) is not None:
         return to_structure(models, names, config), True
     read, size, intrinsics = full_images(dataset)
-    masks = getattr(dataset, "full_mask", None)
-    shots = Shots(names, read, size, pinhole_of(intrinsics, config), is_calibrated=True, mask=masks)
-    _, models = make_models(shots, config, folder)
     # A model that is given is of the images on disk, which the data set may have straightened.
     is_straight = config.model is not None and any(dataset.calibration.get("distortion") or ())
+    camera = of_calibration(dataset.calibration, size) if is_straight else pinhole_of(intrinsics, config)
+    masks = getattr(dataset, "full_mask", None)
+    shots = Shots(names, read, size, camera, is_calibrated=True, mask=masks)
+    _, models = make_models(shots, config, folder)
     return to_structure(models, names, config), is_straight
 
 
@@ -84,6 +85,15 @@ def full_images(dataset: Dataset) -> tuple[Callable[[int], np.ndarray], tuple[in
         return lambda index: dataset[index].image, tuple(dataset.size), tuple(dataset.intrinsics)
     height, width = dataset.full(0).shape[:2]
     return dataset.full, (width, height), tuple(intrinsics)
+
+
+def of_calibration(about: Mapping[str, Any], size: tuple[int, int]) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's camera of the images on disk, from the calibration of a data set."""
+    fx, fy, cx, cy = about["intrinsics"]
+    camera = to_pycolmap(
+        Calibration((fx, fy, cx + 0.5, cy + 0.5), tuple(about["distortion"]), model=about.get("model", "OPENCV")), size
+    )
+    return camera.model_name, tuple(map(float, camera.params))
 
 
 def pinhole_of(intrinsics: Sequence[float], config: StructureConfig) -> tuple[str, tuple[float, ...]]:
