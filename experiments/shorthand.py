@@ -11,7 +11,7 @@ from .command import overrides_of, words_of
 
 NUM_PIXELS, SIDE = 320 * 240, 16  # of a frame, whose sides are multiples of SIDE
 NUM_FRAMES = 150  # about as many frames of a video are taken, evenly
-SECONDS = 3.0  # for an image, from COLMAP to the report, on one core of a laptop
+SECONDS = 5.0  # for an image, from COLMAP to the report, on one core
 
 
 def with_source(arguments: list[str]) -> list[str]:

@@ -209,6 +209,8 @@ def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFra
     progress = partial(tqdm, desc="checking", unit="frame")
     masks = build(config, "masks", _convert_="all") if "masks" in config else Masks()
     frames = ReadableFrames(dataset, config.on_bad_frame, progress, masks)
+    if frames.mask_note:
+        tqdm.write(frames.mask_note)
     if "depth_scale" in config.dataset:  # None: the data set knows
         scale = config.dataset.depth_scale
         check_truth(frames, None if scale is None else float(scale))
@@ -227,7 +229,7 @@ def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
     known = {"classes": list(dataset.classes)} if "classes" in config.prior else {}
     prior = attach_features(config, dataset, build(config, "prior", **known))
     prior.check(dataset, config.slam.window_size)
-    return prior if config.masks.folder is None else Masked(prior)
+    return Masked(prior) if dataset.has_masks else prior
 
 
 def baseline_configs(config: DictConfig) -> dict[str, "BaselineConfig"]:

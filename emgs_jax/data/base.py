@@ -72,6 +72,19 @@ class Dataset(Protocol):
         """The number of a frame in its video, if it has no file of its own."""
         return index
 
+    def mask_file(self, index: int) -> Path | None:
+        """Return the mask that the data set itself has for frame `index`: what is black in it is left out."""
+        return None
+
+    def straight(self, mask: np.ndarray) -> np.ndarray:
+        """Return a mask (h, w) of an image as it is on disk as one of its `full` image."""
+        return mask
+
+    @property
+    def raw_size(self) -> tuple[int, int]:
+        """(width, height) of the images on disk."""
+        return self.size
+
     def fingerprint(self) -> str:
         """Hex digest of all that defines the frames (names and contents of files, options), for provenance."""
         ...

@@ -43,7 +43,7 @@ class Images(Straightened):
             paths = [path] * len(times)
         else:
             self._folder, (paths, times, notes) = path, listed(path)
-        self._chosen = self._select(len(paths), f"{path} ({LAYOUT})")
+        self._select(len(paths), f"{path} ({LAYOUT})")
         self._images, self._times = ([every[row] for row in self._chosen] for every in (paths, times))
         if self._video is None:
             self._tones = tones_of(self._images)
@@ -67,9 +67,6 @@ class Images(Straightened):
         image = self._shown(index)
         reading.check_raw_size(image, self._raw_size, self._place(index)[1])
         return image
-
-    def number(self, index: int) -> int:
-        return index if self._video is None else self._chosen[index]
 
     def _options(self) -> dict[str, Any]:
         lens = {} if self._lens.maps is None else {"lens": self.calibration["distortion"]}

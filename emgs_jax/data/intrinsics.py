@@ -10,7 +10,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import Float32, UInt8
+from jaxtyping import Bool, Float32, UInt8
 from PIL import ExifTags, Image
 
 from emgs_jax.data import reading
@@ -56,6 +56,10 @@ class Lens:
     def straighten(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """Undistort an image, bilinearly."""
         return image if self.maps is None else cv2.remap(image, *self.maps, cv2.INTER_LINEAR)
+
+    def straighten_mask(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+        """A mask of the distorted image, without distortion; a pixel between two is masked if one of them is."""
+        return mask if self.maps is None else cv2.remap(np.uint8(255 * mask), *self.maps, cv2.INTER_LINEAR) > 0
 
     def straighten_depth(self, depth: Float32[np.ndarray, "h w"]) -> Float32[np.ndarray, "h w"]:
         """Undistort depth that is registered to the image, by the nearest, as depths must not be mixed."""

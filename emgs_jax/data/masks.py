@@ -1,7 +1,9 @@
 """Masks: an image for each frame of pixels that are left out, such as people."""
 
+import hashlib
 import re
-from collections.abc import Sequence
+from collections import Counter, defaultdict
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -12,10 +14,13 @@ from jaxtyping import Bool
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
+from emgs_jax.data.file_names import IMAGE_SUFFIXES
 from emgs_jax.data.labels import LabelFolder
 from emgs_jax.ops.ranges import ranged
 
 MAX_STRETCH = 0.02  # relative difference in aspect of a mask and its image
+JPEG_BLACK = 16  # of 255: compression spreads black into its surroundings and back
+MANY = 0.5  # share of an image
 
 
 @dataclass(frozen=True)
@@ -45,40 +50,125 @@ class Masks:
         return LabelFolder(Path(self.folder).expanduser(), Path(self.names).expanduser(), None)
 
     @cached_property
-    def _files(self) -> dict[str, Path]:
-        """Masks by the name of the image, with or without its suffix."""
-        folder = Path(self.folder).expanduser()
-        return {stem(path.name): path for path in sorted(folder.iterdir())} if folder.is_dir() else {}
+    def _paths(self) -> list[Path]:
+        """All images in the folder and below."""
+        found = sorted(Path(self.folder).expanduser().rglob("*"))
+        return [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")]
 
-    def check(self, names: Sequence[str]) -> None:
-        """Raise ValueError if an image of these names has no mask."""
-        missing = [] if self.folder is None else [name for name in names if self._file(name) is None]
+    def files(self, images: Sequence[Path | None], numbers: Sequence[int]) -> list[Path | None]:
+        """The mask of each image, by its name and, where names repeat, its folders; None without a `folder`.
+
+        Args:
+            images: file of each; None for a frame of a video, whose mask is named by its number.
+            numbers: of each, from 0.
+
+        Raises:
+            ValueError: an image has no mask, or two images have the same.
+        """
+        if self.folder is None:
+            return [None] * len(images)
+        by_end, found = defaultdict(list), []
+        for path in self._paths:
+            parts = path.relative_to(Path(self.folder).expanduser()).parts
+            for begin in range(len(parts)):
+                by_end[(*parts[begin:-1], path.stem)].append(path)
+        for image, number in zip(images, numbers, strict=True):
+            if image is None:
+                ends = [(f"{number:06d}",)]
+            else:  # the longest path that a mask ends with; COLMAP's are called NAME.png.png
+                above = image.parts[:-1]
+                ends = [(*above[row:], name) for row in range(len(above) + 1) for name in (image.stem, image.name)]
+            found.append(next((by_end[end][0] for end in ends if len(by_end.get(end, ())) == 1), None))
+        missing = [row for row, path in enumerate(found) if path is None]
         if missing:
+            image = images[missing[0]]
+            name = f"{numbers[missing[0]]:06d}" if image is None else image.stem
             raise ValueError(
-                f"masks.folder={self.folder} has no mask for {missing[0]} (and {len(missing) - 1} more): give a "
-                f"folder with one image for each frame, {missing[0]}.png"
+                f"masks.folder={self.folder} has no mask for {name} (and {len(missing) - 1} more): give a "
+                f"folder with one image for each frame, {name}.png"
+            )
+        if None in images:
+            self._check_first(set(numbers))
+        path, count = Counter(found).most_common(1)[0]
+        if count > 1 and None not in images:
+            raise ValueError(f"{path} is the mask of {count} images: put masks into folders with the names of theirs")
+        return found
+
+    def _check_first(self, used: set[int]) -> None:
+        """ValueError where masks of a video are numbered from 1, as ffmpeg does, and not those of the frames in use."""
+        there = {int(path.stem) for path in self._paths if path.stem.isdecimal()}
+        if 1 in there and 0 not in there and there != used:
+            raise ValueError(
+                f"masks.folder={self.folder} has masks from 1 on, and frames of a video are numbered from 0: call the "
+                "first one 000000.png (ffmpeg: -start_number 0)"
             )
 
-    def _file(self, name: str) -> Path | None:
-        return self._files.get(name, self._files.get(f"{name}.png"))
+    def decoded(self, path: Path, size: tuple[int, int], image: Path | None = None) -> Bool[np.ndarray, "h w"]:
+        """What is left out of an image of (width, height) `size`, without the border.
 
-    def read(self, name: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-        """True where an image of `size` is left out; BadFrameError if its mask cannot be read or has another aspect."""
-        if self.folder is None:
-            return np.zeros(size[::-1], bool)
-        self.check([name])
-        path = self._file(name)
+        Args:
+            image: its file. A mask of the pixels as they are stored is turned as the EXIF of the image says.
+
+        Raises:
+            BadFrameError: the mask cannot be read, or has other sides than its image.
+        """
         if self.classes is None:
-            is_out = reading.decode(path, cv2.IMREAD_GRAYSCALE) == 0
+            values = reading.decode(path, cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH)
+            is_out = values <= (JPEG_BLACK if path.suffix.lower() in (".jpg", ".jpeg") else 0)
         else:
             is_out = np.isin(self._labels.read(path), [self._labels.names.index(one) for one in self.classes])
-        (height, width), turned = is_out.shape, "; it is turned" if is_out.shape == size else ""
-        if abs(width * size[1] / (height * size[0]) - 1.0) > MAX_STRETCH or width < 16:
+        if not _is_alike(is_out, size) and image is not None:
+            is_out = _turned(is_out, reading.orientation(image))
+        if not _is_alike(is_out, size) or is_out.shape[1] < 16:
+            (height, width), turned = is_out.shape, "; it is turned" if is_out.shape == tuple(size) else ""
             raise BadFrameError(
                 f"{path} is {width}x{height}, but its image is {size[0]}x{size[1]}{turned}: make it of that size"
             )
-        image = cv2.resize(np.uint8(255 * is_out), size, interpolation=cv2.INTER_AREA)
-        return cv2.dilate(image, np.ones((2 * self.border + 1,) * 2, np.uint8)) > 0
+        return resized(is_out, size)
+
+    def fitted(self, is_out: Bool[np.ndarray, "_ _"], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+        """A mask for an image of (width, height) `size`, with the border."""
+        kernel = np.ones((2 * self.border + 1,) * 2, np.uint8)
+        return cv2.dilate(np.uint8(resized(is_out, size)), kernel) > 0
+
+    def reader(
+        self, images: Sequence[Path | None], numbers: Sequence[int], size: tuple[int, int]
+    ) -> Callable[[int], Bool[np.ndarray, "h w"] | None]:
+        """A function that reads the mask of image 0 .. n-1, of `size` on disk, with the border; else as `files`."""
+        files = self.files(images, numbers)
+        return lambda row: files[row] and self.fitted(self.decoded(files[row], size, images[row]), size)
+
+    def read(self, name: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"] | None:
+        """What is left out of the image of this name and (width, height) `size`, with the border; as `reader`."""
+        return self.reader([Path(name)], [0], size)(0)
+
+    def fingerprint(self) -> list[object]:
+        """What the masks depend on: options, and the names and contents of files."""
+        if self.folder is None:
+            return []
+        digest = hashlib.blake2b(digest_size=16)
+        for path in self._paths:
+            digest.update(path.name.encode() + reading.read_bytes(path))
+        return [digest.hexdigest(), self.classes and [*self.classes], self.border]
+
+
+def resized(is_out: Bool[np.ndarray, "_ _"], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
+    """A mask in (width, height) `size`; a pixel that covers some of what is left out is left out."""
+    return cv2.resize(np.uint8(255 * is_out), size, interpolation=cv2.INTER_AREA) > 0
+
+
+def _is_alike(is_out: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> bool:
+    """Test whether a mask has the sides' ratio of an image."""
+    height, width = is_out.shape
+    return abs(width * size[1] / (height * size[0]) - 1.0) <= MAX_STRETCH
+
+
+def _turned(values: np.ndarray, orientation: int) -> np.ndarray:
+    """Values as an image of this EXIF orientation is shown; only turns by 90 degrees, which the sides tell."""
+    turns = {5: (0, True), 6: (3, False), 7: (2, True), 8: (1, False)}  # quarters to the left, then transposed
+    quarters, is_transposed = turns.get(orientation, (0, False))
+    found = np.rot90(values, quarters)
+    return np.ascontiguousarray(found.T if is_transposed else found)
 
 
 def masked(frame: Frame, is_out: Bool[np.ndarray, "h w"]) -> Frame:
@@ -90,9 +180,14 @@ def masked(frame: Frame, is_out: Bool[np.ndarray, "h w"]) -> Frame:
 
 def names_of(dataset: Dataset) -> list[str]:
     """A name for each frame in use: its file's, or its number in a video."""
-    files = [dataset.files(index) for index in range(len(dataset))]
+    return image_names(*files_of(dataset))
+
+
+def files_of(dataset: Dataset) -> tuple[list[Path | None], list[int]]:
+    """The image file of each frame in use, None if it has none of its own, and its number."""
+    files = [next(iter(dataset.files(index)), None) for index in range(len(dataset))]
     numbers = [*map(getattr(dataset, "number", int), range(len(dataset)))]
-    return image_names([found[0] if found else None for found in files], numbers)
+    return (files if len({*files}) == len(files) else [None] * len(files)), numbers
 
 
 def image_names(files: Sequence[Path | None], numbers: Sequence[int]) -> list[str]:

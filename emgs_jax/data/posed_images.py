@@ -37,6 +37,7 @@ class Solved:
     files: tuple[Path, ...]
     times: list[float] | None = None  # seconds of images in order of time; None: from their names
     note: str | None = None
+    masks: list[Path | None] | None = None  # of each, as nerfstudio has them; None = there are none
 
 
 @dataclass(eq=False)
@@ -51,6 +52,7 @@ class PosedImages(Straightened):
         self._folder, self._files, self._times = folder, solved.files, [times[place] for place in chosen]
         rows = [order[place] for place in chosen]
         self._images, self._poses = [solved.images[row] for row in rows], [solved.poses[row] for row in rows]
+        self._masks = [None] * len(rows) if solved.masks is None else [solved.masks[row] for row in rows]
         for path, pose in zip(self._images, self._poses, strict=True):
             if pose is not None:
                 reading.check_position(pose[:3, 3], f"{solved.source}, image {path.name},")
@@ -66,6 +68,9 @@ class PosedImages(Straightened):
 
     def pose(self, index: int) -> Pose | None:
         return self._poses[index]
+
+    def mask_file(self, index: int) -> Path | None:
+        return self._masks[index]
 
     def _options(self) -> dict[str, Any]:
         return {"lens": self.calibration["distortion"], "images": [path.name for path in self._images]}
@@ -139,9 +144,10 @@ def read_nerfstudio(path: Path) -> Solved:
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; expected the layout {NERFSTUDIO_LAYOUT}")
     camera = read_calibration(path)
-    names, rows = load_transforms(path)
+    names, rows, masks = load_transforms(path)
     poses = [
         reading.as_pose(" ".join(map(repr, row)), f"{path}, frame {name}")
         for name, row in zip(names, rows, strict=True)
     ]
-    return Solved([find_image(path.parent, name) for name in names], poses, camera, path, (path,))
+    images, masks = [find_image(path.parent, name) for name in names], [mask and path.parent / mask for mask in masks]
+    return Solved(images, poses, camera, path, (path,), masks=masks)

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
-from emgs_jax.data.masks import Masks, masked, names_of
+from emgs_jax.data.masks import MANY, Masks, files_of, masked
 from emgs_jax.data.spool import Spool
 
 MAX_KEPT_BYTES = 2**30  # of cached frames, uncompressed; others are read again
@@ -46,14 +46,9 @@ class ReadableFrames:
         for name in ("name", "sequence", "size", "intrinsics", "calibration", "classes", "has_ground_truth"):
             setattr(self, name, getattr(dataset, name))
         self.full_intrinsics = getattr(dataset, "full_intrinsics", None)
-        self._masks, self._names = masks, () if masks.folder is None else names_of(dataset)
-        masks.check(self._names)
-        if masks.folder is not None and any(dataset.calibration.get("distortion") or ()):
-            raise ValueError(
-                f"{dataset.name} straightens its images, and the masks of {masks.folder} are of the distorted ones: "
-                "straighten both beforehand and give the intrinsics of the straight ones"
-            )
         indices = range(len(dataset))
+        self._masks, self._mask_files = masks, self._files_of_masks(dataset, masks)
+        self.has_masks = any(self._mask_files)
         self.skipped = _unreadable(self._read, progress(indices)) if on_bad_frame == "skip" else {}
         self.kept = tuple(index for index in indices if index not in self.skipped)
         if not self.kept:
@@ -61,6 +56,7 @@ class ReadableFrames:
             first = next(iter(self.skipped.values()), "there are none")
             raise ValueError(f"{what} has no frame that can be read: {first}")
         _check_truth(dataset, self.kept)
+        self.mask_note = self._mask_note() if self.has_masks else None
 
     def __len__(self) -> int:
         return len(self.kept)
@@ -73,8 +69,9 @@ class ReadableFrames:
             frame, places = self._places[index]
             return replace(frame, **{name: self._spool[place] for name, place in places.items()})
         frame = self._dataset[index]
-        if self._masks.folder is not None:
-            frame = masked(frame, self._masks.read(self._names[index], self.size))
+        is_out = self._left_out(index, self.size)
+        if is_out is not None:
+            frame = masked(frame, is_out)
         self._keep(index, frame)
         return frame
 
@@ -88,6 +85,36 @@ class ReadableFrames:
     def full(self, index: int) -> np.ndarray:
         """The image at its size on disk, not cached."""
         return self[index].image if self.full_intrinsics is None else self._dataset.full(self.kept[index])
+
+    def full_mask(self, index: int) -> np.ndarray | None:
+        """What is left out of `full`, bool (h, w); None without a mask."""
+        return self._left_out(self.kept[index], self.size if self.full_intrinsics is None else self._dataset.raw_size)
+
+    def _mask_note(self) -> str:
+        """Say of how many frames there are masks, and how much some of these leave out."""
+        own = [index for index in self.kept if self._mask_files[index] is not None]
+        share = np.mean([self._left_out(index, self.size).mean() for index in own[:: len(own) // 5 + 1]])
+        note = f"masks of {len(own)} of {len(self.kept)} frames leave out {100 * share:.0f} % of the images"
+        advice = "black is left out, white is kept: if yours are white where something is to be left out, invert them"
+        return note if share <= MANY else f"{note}; {advice}"
+
+    @staticmethod
+    def _files_of_masks(dataset: Dataset, masks: Masks) -> list[tuple[Path, Path | None] | None]:
+        """The mask and the image file of each frame of the data set; None where it has no mask."""
+        if masks.folder is None:
+            own = getattr(dataset, "mask_file", lambda _: None)
+            found = [own(index) for index in range(len(dataset))]
+            return [path and (path, dataset.files(index)[0]) for index, path in enumerate(found)]
+        images, numbers = files_of(dataset)
+        return [*zip(masks.files(images, numbers), images, strict=True)]
+
+    def _left_out(self, index: int, size: tuple[int, int]) -> np.ndarray | None:
+        """What the mask of the data set's frame leaves out of its image in this (width, height)."""
+        if self._mask_files[index] is None:
+            return None
+        mask, image = self._mask_files[index]
+        is_out = self._masks.decoded(mask, self._dataset.raw_size, image)
+        return self._masks.fitted(self._dataset.straight(is_out), size)
 
     def pose(self, index: int) -> np.ndarray | None:
         return self._dataset.pose(self.kept[index])

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float32, Int32, UInt8
+from jaxtyping import Bool, Float32, Int32, UInt8
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import Dataset, Frame
@@ -44,7 +44,8 @@ class Straightened(Dataset):
         return found
 
     def _select(self, count: int, where: object) -> range:
-        return reading.select(count, self.start, self.stop, self.stride, where)
+        self._chosen = reading.select(count, self.start, self.stop, self.stride, where)
+        return self._chosen
 
     def _use(self, lens: Lens, raw_size: Size, *notes: str | None) -> None:
         """Set the lens and the size of the images on disk, with notes on them."""
@@ -64,6 +65,16 @@ class Straightened(Dataset):
 
     def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         return self._lens.straighten(self._read(index))
+
+    @property
+    def raw_size(self) -> Size:
+        return self._raw_size
+
+    def straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+        return self._lens.straighten_mask(mask)
+
+    def number(self, index: int) -> int:
+        return self._chosen[index]
 
     def files(self, index: int) -> list[Path]:
         depth = None if self._depths is None else self._depths[index]

@@ -13,11 +13,12 @@ from emgs_jax.data.file_names import find_image
 from emgs_jax.ops.constants import FLIP
 
 
-def load_transforms(path: Path) -> tuple[list[str], list[list[float]]]:
-    """Read file and T_world_camera (16 numbers, OpenCV's axes) of every frame; ValueError if the file is damaged."""
+def load_transforms(path: Path) -> tuple[list[str], list[list[float]], list[str | None]]:
+    """Read file, T_world_camera (16 numbers, OpenCV's axes) and mask of every frame; ValueError if it is damaged."""
     try:
         frames = json.loads(path.read_text(encoding="utf-8-sig", errors="replace"))["frames"]
         names = [frame["file_path"] for frame in frames]
+        masks = [frame.get("mask_path") for frame in frames]
         matrices = [np.array(frame["transform_matrix"], np.float64) for frame in frames]
     except (ValueError, KeyError, TypeError, RecursionError) as error:
         what = "frames with file_path and transform_matrix"
@@ -30,7 +31,8 @@ def load_transforms(path: Path) -> tuple[list[str], list[list[float]]]:
     if len({*names}) < len(names):
         raise ValueError(f"{path} has {next(n for n in names if names.count(n) > 1)} twice: export it again")
     bottom = [[0.0, 0.0, 0.0, 1.0]]
-    return names, [((m if len(m) == 4 else np.vstack([m, bottom])) * FLIP).ravel().tolist() for m in matrices]
+    poses = [((m if len(m) == 4 else np.vstack([m, bottom])) * FLIP).ravel().tolist() for m in matrices]
+    return names, poses, [None if mask is None else str(mask) for mask in masks]
 
 
 def with_frames_camera(values: Mapping[str, Any], keys: Collection[str], path: Path) -> Mapping[str, Any]:

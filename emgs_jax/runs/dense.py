@@ -78,8 +78,10 @@ def dense_map(
                 pictures.append(picture | {"rendered_color": view.colors, "rendered_depth": depth})
             rendered.add(row, depth, view.colors, found)
             # A voxel's colour is the mean of all pixels that see it: those of near and frontal views are most of them.
-            image = dataset[row].image
+            frame = dataset[row]
+            image, is_out = frame.image, frame.mask
             stays = ~moving_mask(vars(run.records[row]), image.shape[1::-1])  # else what is behind has its colour
+            stays &= True if is_out is None else ~is_out
             if config.points == "map":
                 drawn, is_drawn = (view.points, view.normals, image / 255.0), view.valid & stays
                 yield PointCloud(*(values[is_drawn].astype(np.float64) for values in drawn))

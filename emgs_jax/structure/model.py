@@ -7,12 +7,14 @@ from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation, Slerp
+from tqdm import tqdm
 
 from emgs_jax.data.masks import stem
 from emgs_jax.geometry import scale_covariance
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.uncertainty import camera_in_world, covariances
 
+USUAL = 0.1, 100.0  # median depths with which a model keeps its unit: those of metres
 NONE = -1  # world of a frame without a pose
 
 
@@ -83,7 +85,22 @@ def to_structure(models: Sequence[Any], names: Sequence[str], config: StructureC
             shown = {place[point.point3D_id] for point in image.points2D if point.has_point3D()}
             landmarks[frame] = np.array(sorted(shown), int)
     structure = Structure(worlds, world, T, covariance, landmarks, np.zeros(count, bool))
-    return interpolated(in_unit(structure, config.median_depth), config.max_gap)
+    own = config.model is not None and _is_usual(structure)
+    return interpolated(structure if own else in_unit(structure, config.median_depth), config.max_gap)
+
+
+def _is_usual(structure: Structure) -> bool:
+    """Test whether the unit of a model that is given can stay, and say what becomes of it."""
+    depths = [np.median(structure.depths(frame)) for frame in np.flatnonzero(structure.is_placed)]
+    median, (low, high) = float(np.median(depths)) if depths else 1.0, USUAL
+    if low <= median <= high:
+        tqdm.write(f"prior.structure.model: its unit stays (its images look {median:.3g} far, in the median)")
+        return True
+    tqdm.write(
+        f"prior.structure.model: its unit is changed, for its images look {median:.3g} far, in the median, and a map "
+        f"wants {low:g} to {high:g}: lengths are those of prior.structure.median_depth"
+    )
+    return False
 
 
 def in_unit(structure: Structure, median_depth: float) -> Structure:

@@ -30,6 +30,7 @@ class Shots(NamedTuple):
     size: tuple[int, int]  # (width, height)
     camera: tuple[str, tuple[float, ...]]  # COLMAP's model, and parameters in its pixels, or none: its default start
     is_calibrated: bool  # only the distortion may still change
+    mask: Callable[[int], np.ndarray | None] = lambda _: None  # bool (h, w), True where an image is left out
 
 
 def map_images(shots: Shots, config: StructureConfig, folder: Path) -> list[Any]:
@@ -81,7 +82,7 @@ def detect(shots: Shots, config: StructureConfig, folder: Path) -> None:
         check_kinds(extraction.type.name, matcher_of(config).name)
     model, parameters = shots.camera
     reader = pycolmap.ImageReaderOptions(
-        camera_model=model, camera_params=",".join(map(repr, parameters)), mask_path=_masks(shots, config, folder)
+        camera_model=model, camera_params=",".join(map(repr, parameters)), mask_path=_masks(shots, folder)
     )
     names = [name for name in shots.names if f"{name}.png" not in done]
     number = {name: index for index, name in enumerate(shots.names)}
@@ -115,17 +116,14 @@ def _write(shots: Shots, index: int, images: Path) -> bool:
     return image.shape[1::-1] == tuple(shots.size) and cv2.imwrite(str(path), image[..., ::-1], FAST)
 
 
-def _masks(shots: Shots, config: StructureConfig, folder: Path) -> str:
-    """Write masks under COLMAP's names and return their folder, or ''; ValueError if one is missing or does not fit."""
-    if config.masks.folder is None:
-        return ""
+def _masks(shots: Shots, folder: Path) -> str:
+    """Write masks under COLMAP's names and return their folder, or ''; BadFrameError if one cannot be used."""
     own = folder / "masks"
-    config.masks.check(shots.names)
-    own.mkdir(exist_ok=True)
-    for name in shots.names:
-        mask = np.uint8(255 * ~config.masks.read(name, shots.size))
-        cv2.imwrite(str(own / f"{name}.png.png"), mask)
-    return str(own)
+    for index, name in enumerate(shots.names):
+        if (is_out := shots.mask(index)) is not None:
+            own.mkdir(exist_ok=True)
+            cv2.imwrite(str(own / f"{name}.png.png"), np.uint8(255 * ~is_out))
+    return str(own) if own.is_dir() else ""
 
 
 def matcher_of(config: StructureConfig) -> Any:

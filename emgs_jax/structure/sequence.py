@@ -1,6 +1,6 @@
 """The structure of a data set's images, and self-calibration."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from emgs_jax.data.base import Dataset
-from emgs_jax.data.camera_models import PERSPECTIVE, Calibration, from_colmap
+from emgs_jax.data.camera_models import PERSPECTIVE, Calibration, from_colmap, to_pycolmap
 from emgs_jax.data.intrinsics import Pictures, from_exif
 from emgs_jax.data.masks import image_names, names_of
 from emgs_jax.structure.config import StructureConfig
@@ -26,10 +26,12 @@ def structure_of(dataset: Dataset, config: StructureConfig, folder: Path | None)
     if key is not None and (models := models_of(key, folder)) is not None:
         return to_structure(models, names, config), True
     read, size, intrinsics = full_images(dataset)
-    shots = Shots(names, read, size, pinhole_of(intrinsics, config), is_calibrated=True)
-    _, models = make_models(shots, config, folder)
     # A model that is given is of the images on disk, which the data set may have straightened.
     is_straight = config.model is not None and any(dataset.calibration.get("distortion") or ())
+    camera = of_calibration(dataset.calibration, size) if is_straight else pinhole_of(intrinsics, config)
+    masks = getattr(dataset, "full_mask", None)
+    shots = Shots(names, read, size, camera, is_calibrated=True, mask=masks)
+    _, models = make_models(shots, config, folder)
     return to_structure(models, names, config), is_straight
 
 
@@ -39,11 +41,13 @@ def calibrate(
     """Calibrate a camera by COLMAP from all images, starting at the first one's EXIF or a default, and describe it."""
     if config.camera_model not in PERSPECTIVE:
         raise ValueError(f"prior.structure.camera_model={config.camera_model}: there are {', '.join(PERSPECTIVE)}")
-    names = image_names([*pictures.files] or [None] * pictures.count, pictures.numbers or range(pictures.count))
+    files, numbers = [*pictures.files] or [None] * pictures.count, pictures.numbers or range(pictures.count)
+    names, mask = image_names(files, numbers), config.masks.reader(files, numbers, pictures.size)
     (width, height), focal = pictures.size, _exif_focal(pictures)
     is_known = focal is not None and config.camera_model == "SIMPLE_RADIAL"
     start = (focal, width / 2, height / 2, 0.0) if is_known else ()
-    shots = Shots(names, pictures.read, pictures.size, (config.camera_model, start), is_calibrated=False)
+    camera = config.camera_model, start
+    shots = Shots(names, pictures.read, pictures.size, camera, is_calibrated=False, mask=mask)
     key, models = make_models(shots, config, folder)
     image = next(image for image in models[0].images.values() if image.has_pose)
     camera = from_colmap(image.camera.model_name, [*image.camera.params], pictures.size, "COLMAP's self-calibration")
@@ -74,6 +78,15 @@ def full_images(dataset: Dataset) -> tuple[Callable[[int], np.ndarray], tuple[in
         return lambda index: dataset[index].image, tuple(dataset.size), tuple(dataset.intrinsics)
     height, width = dataset.full(0).shape[:2]
     return dataset.full, (width, height), tuple(intrinsics)
+
+
+def of_calibration(about: Mapping[str, Any], size: tuple[int, int]) -> tuple[str, tuple[float, ...]]:
+    """COLMAP's camera of the images on disk, from the calibration of a data set."""
+    fx, fy, cx, cy = about["intrinsics"]
+    camera = to_pycolmap(
+        Calibration((fx, fy, cx + 0.5, cy + 0.5), tuple(about["distortion"]), model=about.get("model", "OPENCV")), size
+    )
+    return camera.model_name, tuple(map(float, camera.params))
 
 
 def pinhole_of(intrinsics: Sequence[float], config: StructureConfig) -> tuple[str, tuple[float, ...]]:

@@ -15,32 +15,38 @@ from filelock import FileLock
 from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.colmap_model import check_whole
-from emgs_jax.data.masks import stem
 from emgs_jax.io.files import write_file
+from emgs_jax.structure import reconstruct
 from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.given import given_models, read_models, stems_of
 from emgs_jax.structure.library import load
-from emgs_jax.structure.reconstruct import DATABASE, Shots, map_database, map_images
+from emgs_jax.structure.reconstruct import Shots, map_images
 
 ABOUT = "structure.json"
+VERSION = 1  # changes with the code of `structure/`, if that makes other models of the same images
 NOT_OF_MODELS = ("model", "median_depth", "pixel_std", "max_gap")  # settings that do not change the models
-PARTS = ("cameras", "images")
 CACHE = Path("~/.cache/emgs_jax/structure")
-SQLITE = b"SQLite format 3\0"  # how its files begin
 
 
 def key_of(shots: Shots, config: StructureConfig) -> str:
-    """Hex digest of pixels, camera, settings and COLMAP's version."""
+    """Hex digest of pixels and masks, camera, settings, and the versions of COLMAP and ours."""
     settings = {name: value for name, value in asdict(config).items() if name not in NOT_OF_MODELS}
-    settings["masks"] = settings["masks"] if config.masks.folder is not None else None
-    about = [settings, shots.camera, shots.is_calibrated, [*shots.names], load().__version__]
+    settings["masks"] = config.masks.fingerprint()
+    about = [settings, shots.camera, shots.is_calibrated, [*shots.names], load().__version__, VERSION, _constants()]
     digest = hashlib.blake2b(json.dumps(about, sort_keys=True, default=str).encode(), digest_size=16)
     for index in range(len(shots.names)):
         try:
             digest.update(np.ascontiguousarray(shots.read(index)).data)
         except BadFrameError:
             digest.update(b"none")
+        if not config.masks.folder and (is_out := shots.mask(index)) is not None:
+            digest.update(np.ascontiguousarray(is_out).data)
     return digest.hexdigest()
+
+
+def _constants() -> dict[str, Any]:
+    """The numbers that models are made with, and nobody sets."""
+    return {name: value for name, value in vars(reconstruct).items() if name.isupper()}
 
 
 def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> tuple[str, list[Any]]:
@@ -139,59 +145,3 @@ def _clear(place: Path) -> None:
     (place / ABOUT).unlink(missing_ok=True)
     for folder in [path for path in place.iterdir() if path.name.isdecimal()]:
         shutil.rmtree(folder)
-
-
-def read_models(place: Path) -> list[Any]:
-    """Read the model of a folder, or its numbered ones, the largest first; ValueError if none or a damaged one."""
-    pycolmap = load()
-    below = [place, *sorted((path for path in place.glob("*") if path.name.isdecimal()), key=lambda p: int(p.name))]
-    found = [folder for folder in below if all(any(folder.glob(f"{part}.*")) for part in PARTS)]
-    if not found:
-        raise ValueError(f"{place} holds no model of COLMAP (cameras, images, points3D as .bin or .txt)")
-    models = []
-    for folder in found:
-        check_whole(folder)
-        try:
-            models.append(pycolmap.Reconstruction(folder))
-        except (RuntimeError, ValueError, IndexError, MemoryError) as error:
-            reason = str(error).splitlines()[0]
-            raise ValueError(f"{folder} is damaged ({reason}): export the model again, or delete the folder") from error
-    return sorted(models, key=lambda model: -model.num_reg_images())
-
-
-def stems_of(model: Any) -> list[str]:
-    """Names of a model's images with a pose."""
-    return sorted(stem(image.name) for image in model.images.values() if image.has_pose)
-
-
-def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any]:
-    """Read the models of `prior.structure.model`, or map a copy of its database; ValueError if that fails."""
-    database = place if place.suffix == ".db" else place / DATABASE
-    key = f"prior.structure.model={config.model}"
-    if not place.exists():
-        raise ValueError(f"{key} does not exist: give the folder of a COLMAP model, or a database")
-    is_model = any(any(folder.glob("cameras.*")) for folder in (place, *place.glob("[0-9]*")) if folder.is_dir())
-    if is_model or not database.is_file():
-        models = read_models(place)
-    else:
-        with database.open("rb") as handle:
-            if handle.read(len(SQLITE)) != SQLITE:  # COLMAP may take it for an empty one
-                raise ValueError(f"{key} is no database of COLMAP, or a damaged one (it is no file of SQLite)")
-        with tempfile.TemporaryDirectory() as work:
-            shutil.copy(database, Path(work) / DATABASE)
-            try:
-                models = map_database(shots, config, Path(work))
-            except RuntimeError as error:
-                raise ValueError(f"{key} is no database of COLMAP, or a damaged one ({error})") from error
-    for model in models:
-        stems = stems_of(model)
-        twice = next((name for name in shots.names if stems.count(name) > 1), None)
-        if twice is not None:
-            raise ValueError(f"{key} has two images {twice}, and only their names tell them apart: export one folder's")
-    named = {name for model in models for name in stems_of(model)}
-    if not named & {*shots.names}:
-        raise ValueError(
-            f"{key} is of other images: it has {', '.join(sorted(named)[:3])}, …, this run "
-            f"{', '.join(shots.names[:3])}, …; names count without folder and suffix"
-        )
-    return models

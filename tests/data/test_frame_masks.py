@@ -1,5 +1,7 @@
 """Masks: what they leave out is left out of truth and predictions, and what is no mask of an image is said."""
 
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -35,7 +37,8 @@ def test_what_is_black_or_of_a_class_is_left_out_with_a_border(tmp_path, image, 
     (tmp_path / "names.txt").write_text("3 wall\n7 person\n8 cat\n")
     names = {"names": str(tmp_path / "names.txt")} if "classes" in more else {}
     masks = Masks(str(written(tmp_path / "masks", ["a b"], image)), **more, **names)
-    is_out = masks.read("a_b", (64, 48))
+    (path,) = masks.files([Path("images/a b.jpg")], [0])
+    is_out = masks.fitted(masks.decoded(path, (64, 48)), (64, 48))
     np.testing.assert_array_equal(is_out, np.indices((48, 64))[1] < columns)
 
 

@@ -29,7 +29,7 @@ class Pictures:
     has_ground_truth, classes = False, ()
 
     def __getitem__(self, index):
-        return SimpleNamespace(image=np.full((16, 24, 3), index, np.uint8))
+        return SimpleNamespace(mask=None, image=np.full((16, 24, 3), index, np.uint8))
 
 
 @pytest.fixture(scope="module")

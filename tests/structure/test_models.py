@@ -9,9 +9,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 from stereo_scene import shots, structure_config
 
+from emgs_jax.structure.given import given_models, read_models
 from emgs_jax.structure.model import NONE, stem, to_structure
 from emgs_jax.structure.reconstruct import DATABASE, drop_points_at_cameras
-from emgs_jax.structure.store import given_models, make_models, read_models, write_models
+from emgs_jax.structure.store import make_models, write_models
 from emgs_jax.structure.uncertainty import camera_in_world
 
 NUM_FRAMES = 8
