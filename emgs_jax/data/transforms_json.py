@@ -41,7 +41,7 @@ def load_transforms(path: Path) -> tuple[list[str], list[list[float]], list[str 
 
 def with_frames_camera(values: Mapping[str, Any], keys: Collection[str], path: Path) -> Mapping[str, Any]:
     """`values` with the camera that stands in every frame; ValueError where frames have different ones."""
-    found = [{key: frame[key] for key in keys & frame.keys()} for frame in _frames(values)]
+    found = [{key: frame[key] for key in keys & frame.keys()} for frame in frames_of(values)]
     whole = [{**{key: values[key] for key in keys & values.keys()}, **own} for own in found]
     for number, camera in enumerate(whole):
         if camera != whole[0]:
@@ -63,7 +63,7 @@ def with_angle_of_view(values: Mapping[str, Any], path: Path) -> Mapping[str, An
         return values
     size = [values.get("w"), values.get("h")]
     if not all(map(_is_number, size)):
-        names = [frame.get("file_path") for frame in _frames(values)]
+        names = [frame.get("file_path") for frame in frames_of(values)]
         files = (find_image(path.parent, name) for name in names if isinstance(name, str))
         size = [*reading.first_size(files, path, reading.AS_STORED)]
     width, height = size
@@ -77,7 +77,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _frames(values: Mapping[str, Any]) -> list[dict[str, Any]]:
+def frames_of(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The frames that are mappings; what else stands in their place is refused where they are read."""
     frames = values.get("frames")
     return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []
