@@ -256,7 +256,10 @@ OF_NERFSTUDIO = [
     (transforms(frames=[FRAME, FRAME]), "has images/img2.png twice: export it again"),
     (transforms(w=320, h=240), "is for images of 320x240, .*: give the calibration of these images"),
     (transforms(fl_x=None), "has no fl_x: add what is missing, in pixels of the images"),
-    (transforms(frames=[FRAME, FRAME | {"file_path": "images/img10.png", "fl_x": 99}]), ": take images of one camera"),
+    (
+        transforms(frames=[FRAME, FRAME | {"file_path": "images/img10.png", "fl_x": 99}]),
+        "2 different cameras .* map those",
+    ),
 ]
 
 

@@ -76,8 +76,8 @@ class Dataset(Protocol):
         """Return the mask that the data set itself has for frame `index`: what is black in it is left out."""
         return None
 
-    def straight(self, mask: np.ndarray) -> np.ndarray:
-        """Return a mask (h, w) of an image as it is on disk as one of its `full` image."""
+    def straight(self, index: int, mask: np.ndarray) -> np.ndarray:
+        """Return a mask (h, w) of image `index` as it is on disk as one of its `full` image."""
         return mask
 
     @property

@@ -14,7 +14,7 @@ from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.camera_models import Calibration, as_number, lens_of, named_lens, refuse_model, size_of
 from emgs_jax.data.colmap_model import load_cameras
-from emgs_jax.data.transforms_json import with_angle_of_view, with_frames_camera
+from emgs_jax.data.transforms_json import frames_of, with_angle_of_view, with_frames_camera
 
 KNOWN_FILES = (
     "COLMAP cameras.txt or .bin, nerfstudio transforms.json, OpenCV or ROS YAML (camera_matrix), ORB-SLAM YAML "
@@ -43,6 +43,7 @@ ORB_MODELS = {
     **dict.fromkeys(("pinhole", "perspective"), "OPENCV"),
     **dict.fromkeys(("kannalabrandt8", "fisheye"), "OPENCV_FISHEYE"),
 }
+_OF_FRAMES = {"fl_x", "fl_y", "cx", "cy", "w", "h", *DISTORTION, "camera_model", "is_fisheye"}
 TRANSFORMS_MODELS = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE", "OPENCV_FISHEYE")
 
 
@@ -148,13 +149,24 @@ def _transforms(values: Mapping[str, Any], path: Path) -> Calibration:
     """Nerfstudio, with one camera for all frames."""
     names = ("fl_x", "fl_y", "cx", "cy", "w", "h")
     camera = {*names, *DISTORTION}
-    values = with_frames_camera(values, camera | {"camera_model", "is_fisheye"}, path)
+    values = with_frames_camera(values, _OF_FRAMES, path)
     values = with_angle_of_view(values, path)
     _check_known(values, camera | TRANSFORMS_KEYS, path)
     model = "OPENCV_FISHEYE" if values.get("is_fisheye") else values.get("camera_model", "OPENCV")
     if model not in TRANSFORMS_MODELS:
         refuse_model(model, TRANSFORMS_MODELS, path)
     return _camera(values, names, path, model if model in COEFFICIENTS else "OPENCV", corner=0.5)
+
+
+def read_cameras(path: Path) -> list[Calibration]:
+    """The camera of each frame of nerfstudio's transforms.json; raises as `read_calibration`."""
+    values, found = parse_keys(reading.read_text(path), path), {}
+    frames = frames_of(values)
+    own = [tuple(sorted((key, str(frame[key])) for key in _OF_FRAMES & frame.keys())) for frame in frames]
+    for key, frame in zip(own, frames, strict=True):
+        if key not in found:
+            found[key] = _transforms({**values, "frames": [frame]}, path)
+    return [found[key] for key in own]
 
 
 def _opencv(values: Mapping[str, Any], path: Path) -> Calibration:

@@ -54,7 +54,7 @@ def read_euroc(folder: Path, camera: str, tolerance: float) -> Solved:
     return Solved(
         [folder / camera / "data" / name for (name,) in names],
         [one and pose(*one) for one in known or [None] * len(times)],
-        found,
+        [found] * len(names),
         images,
         (images, sensor, *([truth] if truth.is_file() else [])),
         times.tolist(),

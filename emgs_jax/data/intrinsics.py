@@ -3,7 +3,7 @@
 import math
 import struct
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from numbers import Real
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from emgs_jax.data.camera_models import Calibration, from_colmap, lens_of
 from emgs_jax.data.plausible_camera import is_impossible, oddities, other_reading, view_deg
 from emgs_jax.data.reading import Intrinsics, Number, Size
 from emgs_jax.data.tones import Tones, read_shown
-from emgs_jax.data.undistortion import Maps, undistortion
+from emgs_jax.data.undistortion import Maps, tables, undistortion
 
 DIAGONAL_35_MM = 43.27  # of 36 mm x 24 mm, by which cameras scale at any aspect (COLMAP's rule)
 MAX_ASPECT_CHANGE = 0.02  # from the picture that the camera took to the file
@@ -52,10 +52,15 @@ class Lens:
     intrinsics: Intrinsics  # fx, fy, cx, cy of the undistorted images, which have the size of those on disk
     maps: Maps | None  # tables of cv2.remap; None without distortion
     about: Mapping[str, Any]  # origin of the intrinsics for metrics.json
+    border: int = cv2.BORDER_CONSTANT  # what lies beyond the image: black, or the pixel at its border
+
+    def of(self, camera: Calibration, size: Size) -> "Lens":
+        """The lens of a similar camera, whose images are undistorted to the same pinhole camera."""
+        return replace(self, maps=tables(camera, self.intrinsics, size), border=cv2.BORDER_REPLICATE)
 
     def straighten(self, image: UInt8[np.ndarray, "h w 3"]) -> UInt8[np.ndarray, "h w 3"]:
         """Undistort an image, bilinearly."""
-        return image if self.maps is None else cv2.remap(image, *self.maps, cv2.INTER_LINEAR)
+        return image if self.maps is None else cv2.remap(image, *self.maps, cv2.INTER_LINEAR, borderMode=self.border)
 
     def straighten_mask(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
         """A mask of the distorted image, without distortion; a pixel between two is masked if one of them is."""

@@ -59,7 +59,7 @@ def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:
     clocked = enumerate(read_rows(clock, len(paths)), 1)
     times = [float(_numbers(row, 1, f"{clock}, line {line}:")[0]) for line, row in clocked]
     files = calibration, clock, *([] if truth is None else [truth])
-    return Solved(paths, poses, intrinsics, truth or calibration, files, times)
+    return Solved(paths, poses, [intrinsics] * len(paths), truth or calibration, files, times)
 
 
 def read_rows(path: Path, count: int) -> list[str]:

@@ -4,6 +4,7 @@ Their poses are a reference for the trajectory; those of a program have its own 
 has a meaning. Images are not turned by their EXIF orientation, as these programs do not turn them.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -12,10 +13,10 @@ import numpy as np
 from jaxtyping import Float
 
 from emgs_jax.data import reading
-from emgs_jax.data.calibration_files import Calibration, read_calibration
+from emgs_jax.data.calibration_files import Calibration, read_cameras
 from emgs_jax.data.colmap_model import SparseModel, is_model, load_colmap
 from emgs_jax.data.file_names import IMAGE_SUFFIXES, find_image, natural_order, times_of
-from emgs_jax.data.intrinsics import to_lens
+from emgs_jax.data.intrinsics import check_image_size, to_lens
 from emgs_jax.data.straightened import Straightened
 from emgs_jax.data.tones import tones_of
 from emgs_jax.data.transforms_json import load_transforms
@@ -23,6 +24,7 @@ from emgs_jax.data.transforms_json import load_transforms
 Pose = Float[np.ndarray, "4 4"]
 COLMAP_LAYOUT = "root[/sequence]/{images/, sparse/0/{cameras,images}.txt or .bin}"
 NERFSTUDIO_LAYOUT = "root[/sequence]/{transforms.json, images/}"
+MAX_ZOOM = 0.05  # relative difference of focal lengths up to which images are brought to one camera
 MODEL_FOLDERS = ("sparse/0", "sparse", ".", "colmap/sparse/0")  # sparse/0 stands for all that are numbered
 
 
@@ -32,8 +34,8 @@ class Solved:
 
     images: list[Path]
     poses: list[Pose | None]  # T_world_camera of each, in the program's unit
-    camera: Calibration  # of all images
-    source: Path  # file of poses and camera
+    cameras: list[Calibration]  # of each; one serves for all
+    source: Path  # file of poses and cameras
     files: tuple[Path, ...]
     times: list[float] | None = None  # seconds of images in order of time; None: from their names
     note: str | None = None
@@ -62,9 +64,14 @@ class PosedImages(Straightened):
                 f"{self._images[0].parent}: put the images there"
             )
         raw_size = reading.first_size(self._images, self._images[0].parent, self._flags)
-        lens = to_lens(solved.camera, raw_size, str(solved.source), {"source": solved.source.name})
+        camera, of_cameras = common_camera([solved.cameras[row] for row in rows], solved.source)
+        if of_cameras:
+            self._cameras = [solved.cameras[row] for row in rows]
+            for own in {*self._cameras}:
+                check_image_size(own, raw_size, str(solved.source))
+        lens = to_lens(camera, raw_size, str(solved.source), {"source": solved.source.name})
         self._tones = tones_of(self._images)
-        self._use(lens, raw_size, solved.note, note, reading.transparency_note(self._images))
+        self._use(lens, raw_size, solved.note, note, of_cameras, reading.transparency_note(self._images))
 
     def pose(self, index: int) -> Pose | None:
         return self._poses[index]
@@ -73,7 +80,30 @@ class PosedImages(Straightened):
         return self._masks[index]
 
     def _options(self) -> dict[str, Any]:
-        return {"lens": self.calibration["distortion"], "images": [path.name for path in self._images]}
+        own = {} if self._cameras is None else {"cameras": self._cameras}
+        return {"lens": self.calibration["distortion"], "images": [path.name for path in self._images]} | own
+
+
+def common_camera(cameras: Sequence[Calibration], source: Path) -> tuple[Calibration, str | None]:
+    """The camera of median focal length, to which all images are brought; and words where they have their own.
+
+    A camera that focuses changes its focal length a little, and COLMAP may solve for a camera for each image.
+
+    Raises:
+        ValueError: they differ by more than `MAX_ZOOM`.
+    """
+    different = {*cameras}
+    if len(different) < 2:
+        return cameras[0], None
+    ordered = sorted(cameras, key=lambda camera: camera.intrinsics[0])
+    low, high = ordered[0].intrinsics[0], ordered[-1].intrinsics[0]
+    words = f"the images are of {len(different)} different cameras (focal lengths of {low:.1f} to {high:.1f} px)"
+    if high / low - 1 > MAX_ZOOM or len({(camera.size, camera.model) for camera in cameras}) > 1:
+        raise ValueError(
+            f"{source}: {words}: map those of one (dataset.start, dataset.stop), with focus and zoom locked; or solve "
+            "for one camera (COLMAP: --ImageReader.single_camera 1)"
+        )
+    return ordered[len(ordered) // 2], f"{words}, and are brought to one"
 
 
 def in_order(solved: Solved) -> tuple[list[int], list[float], str | None]:
@@ -125,29 +155,24 @@ def find_model(folder: Path, model: str | None) -> SparseModel:
 
 
 def read_colmap(found: SparseModel, folder: Path) -> Solved:
-    """The images of a sparse model, in `folder`; ValueError if they are of several cameras."""
-    used = {found.cameras[camera_id] for camera_id in found.camera_ids}
-    if len(used) > 1:
-        raise ValueError(
-            f"{found.files[0]}: the images are of {len(used)} different cameras: map those of one, or run COLMAP with "
-            "--ImageReader.single_camera 1 where they were taken by one"
-        )
+    """The images of a sparse model, in `folder`."""
     images = [find_image(folder, name) for name in found.names]
     there = sum(path.suffix.lower() in IMAGE_SUFFIXES for path in folder.rglob("*"))
     note = f"{found.files[1]} has {len(images)} of the {there} images in {folder}; the others have no pose"
     lacking = note if there > len(images) else None
-    return Solved(images, [*found.T_world_camera], used.pop(), found.files[1], found.files, note=lacking)
+    cameras = [found.cameras[number] for number in found.camera_ids]
+    return Solved(images, [*found.T_world_camera], cameras, found.files[1], found.files, note=lacking)
 
 
 def read_nerfstudio(path: Path) -> Solved:
     """Read the frames of a transforms.json, whose poses may be inf or nan; ValueError if it is damaged."""
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist; expected the layout {NERFSTUDIO_LAYOUT}")
-    camera = read_calibration(path)
+    cameras = read_cameras(path)
     names, rows, masks = load_transforms(path)
     poses = [
         reading.as_pose(" ".join(map(repr, row)), f"{path}, frame {name}")
         for name, row in zip(names, rows, strict=True)
     ]
     images, masks = [find_image(path.parent, name) for name in names], [mask and path.parent / mask for mask in masks]
-    return Solved(images, poses, camera, path, (path,), masks=masks)
+    return Solved(images, poses, cameras, path, (path,), masks=masks)

@@ -114,7 +114,7 @@ class ReadableFrames:
             return None
         mask, image = self._mask_files[index]
         is_out = self._masks.decoded(mask, self._dataset.raw_size, image)
-        return self._masks.fitted(self._dataset.straight(is_out), size)
+        return self._masks.fitted(self._dataset.straight(index, is_out), size)
 
     def pose(self, index: int) -> np.ndarray | None:
         return self._dataset.pose(self.kept[index])

@@ -35,6 +35,7 @@ class Straightened(Dataset):
     _flags = 0  # of OpenCV's decoder
     _depths = None  # file of each image or None; None without depths
     _depth_scale = 1.0  # raw units per metre
+    _cameras = None  # of each image; None = all are of one
     _files = ()  # that all frames depend on
 
     def _find(self, sequence: str | None) -> Path:
@@ -64,14 +65,17 @@ class Straightened(Dataset):
         return Frame(index, *self._place(index), image, depth, pose, labels)
 
     def full(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
-        return self._lens.straighten(self._read(index))
+        return self._lens_at(index).straighten(self._read(index))
 
     @property
     def raw_size(self) -> Size:
         return self._raw_size
 
-    def straight(self, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
-        return self._lens.straighten_mask(mask)
+    def straight(self, index: int, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
+        return self._lens_at(index).straighten_mask(mask)
+
+    def _lens_at(self, index: int) -> Lens:
+        return self._lens if self._cameras is None else self._lens.of(self._cameras[index], self._raw_size)
 
     def number(self, index: int) -> int:
         return self._chosen[index]
@@ -99,7 +103,7 @@ class Straightened(Dataset):
         if self._depths[index] is None:
             return np.zeros(self.size[::-1], np.float32)
         raw = reading.read_depth(self._depths[index], self._depth_scale, self._raw_size)
-        return reading.resize_nearest(self._lens.straighten_depth(raw), self.size)
+        return reading.resize_nearest(self._lens_at(index).straighten_depth(raw), self.size)
 
     def _labels_of(self, index: int) -> Int32[np.ndarray, "h w"] | None:
         return None

@@ -37,7 +37,7 @@ def load_transforms(path: Path) -> tuple[list[str], list[list[float]], list[str 
 
 def with_frames_camera(values: Mapping[str, Any], keys: Collection[str], path: Path) -> Mapping[str, Any]:
     """Add the camera that every frame has to `values`; ValueError if they differ."""
-    found = [{key: frame[key] for key in keys & frame.keys()} for frame in _frames(values)]
+    found = [{key: frame[key] for key in keys & frame.keys()} for frame in frames_of(values)]
     whole = [{**{key: values[key] for key in keys & values.keys()}, **own} for own in found]
     for number, camera in enumerate(whole):
         if camera != whole[0]:
@@ -59,7 +59,7 @@ def with_angle_of_view(values: Mapping[str, Any], path: Path) -> Mapping[str, An
         return values
     size = [values.get("w"), values.get("h")]
     if not all(map(_is_number, size)):
-        names = [frame.get("file_path") for frame in _frames(values)]
+        names = [frame.get("file_path") for frame in frames_of(values)]
         files = (find_image(path.parent, name) for name in names if isinstance(name, str))
         size = [*reading.first_size(files, path, reading.AS_STORED)]
     width, height = size
@@ -73,7 +73,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
-def _frames(values: Mapping[str, Any]) -> list[dict[str, Any]]:
+def frames_of(values: Mapping[str, Any]) -> list[dict[str, Any]]:
     """The frames that are mappings; others are refused by `load_transforms`."""
     frames = values.get("frames")
     return [frame for frame in frames if isinstance(frame, dict)] if isinstance(frames, list) else []

@@ -36,6 +36,17 @@ def undistortion(camera: Calibration, size: Size, what: str = "dataset.intrinsic
     return straight, maps, share
 
 
+def tables(camera: Calibration, straight: Intrinsics, size: Size) -> Maps:
+    """Where each pixel of a pinhole camera with these intrinsics is in an image of `camera`, both of this size."""
+    if not camera.is_pinhole:
+        return _tables(to_pycolmap(camera, size), straight, size)
+    fx, fy, cx, cy = straight
+    own_fx, own_fy, own_cx, own_cy = camera.intrinsics
+    columns, rows = np.arange(size[0], dtype=np.float64), np.arange(size[1], dtype=np.float64)
+    u, v = np.meshgrid((columns - cx) / fx * own_fx + own_cx, (rows - cy) / fy * own_fy + own_cy)
+    return u.astype(np.float32), v.astype(np.float32)
+
+
 def _reach(lens: object, size: Size) -> Float[np.ndarray, " 4"]:
     """How far the whole image sees to its left, right, top and bottom, at depth 1."""
     columns, rows = (np.linspace(0, side - 1, NUM_BORDER) for side in size)
