@@ -54,13 +54,10 @@ class VoxelConfig:
 
 @dataclass(frozen=True)
 class TsdfConfig:
-    """A truncated signed distance field (Curless and Levoy 1996), fused by Open3D on the CPU.
-
-    Surfaces nearer to each other than the truncation disturb each other.
-    """
+    """A truncated signed distance field (Curless and Levoy 1996), fused by Open3D on the CPU."""
 
     voxel_m: float = number(0.02, low=1e-6)
-    truncation_m: float = number(0.08, low=1e-6)  # where the field ends; a few voxels, more than the noise of a depth
+    truncation_m: float = number(0.08, low=1e-6)  # more than a depth's noise; nearer surfaces disturb each other
     min_views: int = number(1, low=1)  # that must have seen a place
 
     def __post_init__(self) -> None:

@@ -31,10 +31,7 @@ def _taps(config: SweepConfig) -> list[tuple[int, int]]:
 
 
 def census(gray: Float[Array, "h w"], config: SweepConfig, scale: int = 1) -> UInt32[Array, "h w"]:
-    """Census transform (Zabih and Woodfill, ECCV 1994): a bit for each neighbour that is brighter than the pixel.
-
-    `scale` multiplies the neighbours' spacing.
-    """
+    """Census transform (Zabih and Woodfill, ECCV 1994): a bit for each brighter neighbour, spaced `scale` times."""
     reach = scale * config.census_radius
     height, width = gray.shape
     padded = jnp.pad(gray, reach, mode="edge")

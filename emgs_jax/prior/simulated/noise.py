@@ -66,12 +66,9 @@ def rigid(xi: np.ndarray, translation: float, rotation: float) -> np.ndarray:
 
 
 def smooth_field(shape: tuple[int, int], length: float, key: tuple[int, ...], image_share: float) -> np.ndarray:
-    """A unit-variance Gaussian field (h, w), float32, with correlation exp(-r²/2·length²), r in pixels.
-
-    White noise on a grid of spacing length/√2, filtered by a Gaussian of that σ.
-    """
+    """A unit-variance Gaussian field (h, w), float32, with correlation exp(-r²/2·length²), r in pixels."""
     rows, columns = (gaussian_weights(n, length / math.sqrt(2)) for n in shape)
-    noise = shared_normals((rows.shape[1], columns.shape[1]), key, image_share)
+    noise = shared_normals((rows.shape[1], columns.shape[1]), key, image_share)  # white, filtered by a Gaussian
     # einsum and not @, whose sums depend on the number of BLAS threads.
     return np.einsum("hj,wj->hw", np.einsum("hi,ji->hj", rows, np.ascontiguousarray(noise.T)), columns)
 
