@@ -12,7 +12,7 @@ import numpy as np
 
 from emgs_jax.back_end.factors import Factor
 from emgs_jax.back_end.state import BackEnd, BackEndConfig, Node
-from emgs_jax.data.reading import fingerprint
+from emgs_jax.data.reading import fingerprint, resize_nearest
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.map_file import load_map
 from emgs_jax.io.npz import load_headed, save_headed
@@ -60,7 +60,7 @@ class SavedMap:
 
 def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
     """Write what `load_places` reads."""
-    keyframes = end.database.keyframes
+    keyframes = _on_one_grid(end.database.keyframes)
     header = HEADER | {
         "depth_noise": depth_noise,
         "num_trained": end.database.num_trained,
@@ -78,6 +78,15 @@ def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
     for name, field in LOOPS.items():
         arrays |= _table(name, getattr(end, field), LoopMeasurement.__annotations__)
     save_headed(path, header, arrays)
+
+
+def _on_one_grid(keyframes: Sequence[Keyframe]) -> list[Keyframe]:
+    """Keyframes with depths on the grid of the first one: merged runs may have had others."""
+    shape = keyframes[0].depths.shape
+    return [
+        one if one.depths.shape == shape else replace(one, depths=resize_nearest(one.depths, shape[::-1]))
+        for one in keyframes
+    ]
 
 
 def load_places(path: Path, end: BackEnd) -> tuple[BackEnd, float]:

@@ -202,7 +202,10 @@ def begin(atlas: Atlas, window: WindowInput) -> Atlas | None:
     map = replace(alone.map, birth=jnp.full_like(alone.map.birth, before.time))
     atlas = _with_world_left(atlas)
     atlas = replace(atlas, graph=replace(graph, active=max(atlas.submaps) + 1), world=place_world(window, last))
-    return with_state(atlas, replace(alone, map=map, time=before.time + 1), config)
+    looks = alone.looks
+    if looks is not None:  # those of this frame; the others have not been
+        looks = replace(looks, time=jnp.where(looks.time < 0, looks.time, looks.time + before.time))
+    return with_state(atlas, replace(alone, map=map, time=before.time + 1, looks=looks), config)
 
 
 def _with_world_left(atlas: Atlas) -> Atlas:

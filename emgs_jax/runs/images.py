@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from pathlib import Path
 
+from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -21,7 +22,7 @@ def images_of(run: FinishedRun) -> tuple[ReadableFrames | None, str]:
         dataset = build_dataset(OmegaConf.create(dict(settings)))
     except OmegaConfBaseException as error:  # a key of ours that the settings of older code do not have
         return None, f"The images are not shown: the run is of another version ({str(error).splitlines()[0]})."
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, InstantiationException) as error:
         return None, f"The images are not shown: {message_of(error)}"
     if len(dataset) != count:
         return None, f"The images are not shown: there are {len(dataset)} now, and {count} were mapped."

@@ -93,12 +93,32 @@ def with_records(end: BackEnd, records: Sequence[FrameRecord], online: np.ndarra
     return replace(end, nodes=(*end.nodes[:first], *known), first_node=first), lost
 
 
+def check_features(first: FinishedRun, other: FinishedRun) -> None:
+    """ValueError where the features of two runs are of other models, or mean other classes."""
+    one, two = first.text, other.text
+    if one is None or two is None:
+        return
+    is_one_space = one.model == two.model and one.vectors.shape[1] == two.vectors.shape[1]
+    if is_one_space:
+        is_same_name = np.array([[a == b for b in two.names] for a in one.names])
+        is_same_vector = (one.vectors[:, None] == two.vectors).all(-1)
+        is_one_space = (is_same_name == is_same_vector).all()
+    if not is_one_space:
+        raise ValueError(
+            f"features of {other.folder} ({', '.join(two.names[:3])}, …) are not those of {first.folder} "
+            f"({', '.join(one.names[:3])}, …): map both with the same features= and the same classes"
+        )
+
+
 def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, list[int], dict[int, str]]:
     """Join all runs with the first one, each where it shows places of it or of one that is joined already.
 
     Returns the run of all, the order in which their frames are in it, and why a run of these was not joined. Without
-    `has_truth` the true poses are not in one world, and left out. ValueError where none can be joined with the first.
+    `has_truth` the true poses are not in one world, and left out. ValueError where none can be joined with the first,
+    or features mean something else.
     """
+    for other in runs[1:]:
+        check_features(runs[0].finished, other.finished)
     atlas, order, pending, reasons = runs[0].atlas, [0], [*range(1, len(runs))], {}
     while pending:
         for number in pending:
