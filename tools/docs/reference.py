@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[2]
 CONF, PACKAGE = ROOT / "conf", ROOT / "emgs_jax"
 KEYS = """# Every key
 
-Every file of `conf/` in this version. `emgs run --cfg job` prints the keys of a run with their values. `GROUP=OPTION` chooses
-the file `conf/GROUP/OPTION.yaml`; a path changes one key: `slam.em.noise=0.5`.
+Every file of `conf/` in this version. `emgs run --cfg job` prints the keys of a run with their values. `GROUP=OPTION`
+chooses the file `conf/GROUP/OPTION.yaml`; a path changes one key: `slam.em.noise=0.5`.
 """
 NAMES = """# Python
 
