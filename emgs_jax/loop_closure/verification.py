@@ -134,7 +134,7 @@ def neighbours_of(
 def _check_neighbours(
     found: Aligned, query: Keyframe, neighbours: Sequence[Neighbour], config: VerificationConfig
 ) -> None:
-    """Check that enough neighbours are verified, and that each places the query where the candidate does."""
+    """Check that enough neighbours are verified, and that each of these places the query where the candidate does."""
     verified = 0
     for neighbour in neighbours:
         try:

@@ -132,9 +132,10 @@ def _start(problem: Problem, initial: Linear, config: PoseGraphConfig) -> Linear
 
 
 def _solve(problem: Problem, initial: Linear, config: PoseGraphConfig) -> tuple[Linear, int, bool]:
-    """Search once, and if a loop was downweighted once more with all loops at full weight; return the better result.
+    """Search once; if that downweights a loop, search again from the solution with all loops at full weight.
 
-    The cost of a loop is bounded, so a loop that is strongly violated at the start would stay an outlier.
+    Returns the better result. The cost of a loop is bounded, so a loop that is strongly violated at the start would
+    stay an outlier.
     """
     found = _minimize(problem, _start(problem, initial, config), config)
     is_loop = np.asarray(problem.graph.factors.is_loop)

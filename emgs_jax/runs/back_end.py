@@ -67,7 +67,7 @@ def _outcomes(end: BackEnd) -> list[dict[str, str]]:
 
 
 def revisit_note(end: BackEnd | None) -> list[str]:
-    """Return a line if the prior could not be queried for loops, with the remedy; none if it could."""
+    """Return a line, with the remedy, if the prior answered none of the queries for loops; otherwise no line."""
     if end is None or set(end.queries.values()) != {SILENT}:
         return []
     why = f"loops: {len(end.queries)} were measured by keypoints alone, because the prior has no answer for both"
