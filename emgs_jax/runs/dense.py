@@ -77,9 +77,9 @@ def dense_map(
                 picture = {"image": image, "title": f"frame {title}", "valid": view.valid, "labels": labels}
                 pictures.append(picture | {"rendered_color": view.colors, "rendered_depth": depth})
             rendered.add(row, depth, view.colors, found)
-            # A voxel's colour is the mean of all pixels that see it; most of them are from near and frontal views.
+            # A voxel's colour is the mean of all pixels that see it: those of near and frontal views are most of them.
             image = dataset[row].image
-            stays = ~moving_mask(vars(run.records[row]), image.shape[1::-1])  # else what is behind gets its colour
+            stays = ~moving_mask(vars(run.records[row]), image.shape[1::-1])  # else what is behind has its colour
             if config.points == "map":
                 drawn, is_drawn = (view.points, view.normals, image / 255.0), view.valid & stays
                 yield PointCloud(*(values[is_drawn].astype(np.float64) for values in drawn))
