@@ -1,8 +1,8 @@
 """MonoEM-GS as pure functions in JAX: everything that a user needs, by name.
 
-`map_sequence(load_config("dataset=images", …))` maps a sequence; `init_state` and `step` are the same for a loop of
-your own. Importing this module loads nothing else: a name is fetched when it is first used. Import it before JAX, or
-JAX prints a line for every executable that it reads from the compilation cache.
+`map_sequence(load_config("dataset=images", …))` maps a sequence; for a loop of your own use `init_state` and `step`.
+Importing this module loads nothing else: a name is loaded when it is first used. Import it before JAX, or JAX prints a
+line for every executable that it reads from the compilation cache.
 """
 
 # ruff: noqa: F401 (names for type checkers)

@@ -1,4 +1,4 @@
-"""Expectation-maximisation map update (Method D, eq. 2 to 4): aligned points move the Gaussians that explain them."""
+"""Expectation-maximisation map update (Method D, eq. 2 to 4): aligned points update the Gaussians that explain them."""
 
 import math
 from collections.abc import Callable
@@ -42,16 +42,16 @@ class EmConfig(eqx.Module):
         num_candidates: Gaussians near a block of points, among which the K of each point are searched.
         min_normal_cos: τ_n, on the mean over the neighbours of n_k · n_i.
         max_mahalanobis_sq: τ_Σ, on the smallest squared Mahalanobis distance (R1).
-        max_log_gap: τ_π, on the gap between the best explanation and the best possible one; `inf` as printed (R3).
+        max_log_gap: τ_π, on the gap between the best possible log-joint and the best one found; `inf` as printed (R3).
         determinant_weight: of -log|Σ|; 1 printed, 0.5 a Gaussian's (R2).
         normal_weight: κ1.
         feature_weight: κ2.
         support: δ as `printed`, clipped to 1, or `normalized` by the total responsibility (R5).
         average: gain and blend (R4, R13).
-        feature: of a Gaussian: the one that it was made with (`medoid`, printed), or `accumulated` (R16).
-        noise: factor on the points' noise along their viewing rays, which widens every Gaussian when a point is
-            compared with it; 0 as printed.
-        min_responsibility: a Gaussian that receives less in total from a frame is left as it is.
+        feature: a Gaussian keeps its first one (`medoid`, printed), or sums those of all frames, `accumulated` (R16).
+        noise: factor on a point's noise along its viewing ray, which widens every Gaussian that it is compared with; 0
+            as printed.
+        min_responsibility: a Gaussian that receives less in total from a frame stays unchanged.
         min_std: m; floor of the new covariances.
     """
 
@@ -72,13 +72,13 @@ class EmConfig(eqx.Module):
 
 
 class EStep(eqx.Module):
-    """Data association of points with Gaussians, by blocks of points that are near each other.
+    """Data association of points with Gaussians, in blocks of neighbouring points.
 
     Args:
         near: the Gaussians near each block of points.
-        responsibilities: r^ik of the points of each block; over its Gaussians they sum to 1, or are 0 where the point
-            takes no part. Only the K nearest of a point have any.
-        is_fused: the points that pass every gate, in their order.
+        responsibilities: r^ik of the points of each block. Over its Gaussians they sum to 1, or to 0 for a point that
+            takes no part; only the K nearest of a point are not 0.
+        is_fused: the points that pass every gate, in the order of the points.
     """
 
     near: Nearby
@@ -87,7 +87,7 @@ class EStep(eqx.Module):
 
 
 def owners(step: EStep, num_gaussians: int) -> Int[Array, "m"]:
-    """The Gaussian that explains each point best; `num_gaussians` where none does."""
+    """Find the Gaussian that explains each point best; `num_gaussians` where none does."""
     best = jnp.argmax(step.responsibilities, axis=-1)
     rows = jnp.take_along_axis(step.near.rows, best, axis=-1)
     rows = jnp.where(jnp.any(step.responsibilities > 0, axis=-1), rows, num_gaussians)
@@ -95,7 +95,7 @@ def owners(step: EStep, num_gaussians: int) -> Int[Array, "m"]:
 
 
 class EmInfo(eqx.Module):
-    """Counts of one update, and the mean log-joint of the fused points."""
+    """Statistics of one update: counts, and the mean log-joint of the fused points."""
 
     num_points: Int[Array, ""]
     num_fused: Int[Array, ""]
@@ -111,19 +111,19 @@ def e_step(
     config: EmConfig,
     index: GaussianIndex | None = None,
 ) -> tuple[EStep, Float[Array, "m"]]:
-    """Responsibilities of the K nearest Gaussians for every point (eq. 2 and 3), and each point's best log-joint.
+    """Compute the responsibilities of the K nearest Gaussians for every point (eq. 2 and 3), and its best log-joint.
 
     Args:
         gaussians: n of them, world frame.
         points: m observed points, world frame.
         noise: m; standard deviation of every point along its viewing ray, as a vector.
-        index: of the Gaussians; None makes it here.
+        index: of the Gaussians; None builds it here.
     """
     return _e_step(gaussians, *_sound(points, noise), config, index_of(gaussians) if index is None else index)
 
 
 def _sound(points: Observation, noise: Float[Array, "m 3"]) -> tuple[Observation, Float[Array, "m 3"]]:
-    """Points and their noise; one whose noise is not finite is invalid."""
+    """Invalidate points whose noise is not finite."""
     has_noise = jnp.all(jnp.isfinite(noise), axis=-1)
     points = sound(eqx.tree_at(lambda o: o.valid, points, points.valid & has_noise))
     return points, jnp.where(points.valid[:, None], noise, 0.0)
@@ -132,12 +132,12 @@ def _sound(points: Observation, noise: Float[Array, "m 3"]) -> tuple[Observation
 def _e_step(
     gaussians: Gaussians, points: Observation, noise: Float[Array, "m 3"], config: EmConfig, index: GaussianIndex
 ) -> tuple[EStep, Float[Array, "m"]]:
-    """`e_step` of points that are sound."""
+    """Do the E-step for points with finite noise."""
     near = nearby(points.points, points.valid, index.groups, config.num_candidates, BLOCK)
     meaning = eqx.tree_at(lambda g: g.features, gaussians, safe_normalize(gaussians.features))
     table = meaning, index.white
     blocks, noise = take_rows((points, noise), near.queries)
-    # Where a block has room left there is no point.
+    # The last block may have fewer points.
     blocks = eqx.tree_at(lambda o: o.valid, blocks, blocks.valid & (near.queries < points.valid.shape[0]))
     parts = split_rows((near, blocks, noise), MAX_BLOCKS)
     explained = jax.lax.map(lambda part: _explain(table, *part, config), parts)
@@ -153,14 +153,14 @@ def _explain(
     noise: Float[Array, "b q 3"],
     config: EmConfig,
 ) -> tuple[Float[Array, "b q c"], Bool[Array, "b q"], Float[Array, "b q"]]:
-    """The E-step for blocks of points and the Gaussians near them: every point of a block with each of these."""
+    """Do the E-step for blocks: compare every point of a block with each Gaussian near the block."""
     gaussians, (triangles, logdets) = take_rows(table, near.rows)
     offsets = between(points.points, gaussians.means)
     ray, normals = (down(vectors) for vectors in (config.noise * noise, points.normals))
     found = among_nearest(dot(offsets, offsets), near.exists[:, None], config.num_neighbours)
     distance_sq, log_growth = widened_distance_sq(*(whiten(across(triangles), x) for x in (offsets, ray)))
     normal_cos = dot(across(gaussians.normals), normals)
-    # Without one of the features the term must vanish.
+    # If either feature is missing, the term must vanish.
     feature_gap = 0.0
     if gaussians.features.shape[-1]:
         both = has_feature(points.features)[:, :, None] & has_feature(gaussians.features)[:, None]
@@ -171,7 +171,7 @@ def _explain(
     log_joint += config.normal_weight * (normal_cos - 1.0) + config.feature_weight * feature_gap
 
     has_neighbour = jnp.any(found, axis=-1)
-    some = found | ~has_neighbour[..., None]  # a reduction over nothing has no value; such points are left out below
+    some = found | ~has_neighbour[..., None]  # a reduction over nothing has no value; these points are masked below
     best = jnp.max(jnp.where(some, log_joint, -jnp.inf), axis=-1)
     log_gap = jnp.max(jnp.where(some, log_det_term, -jnp.inf), axis=-1) - best
     mean_cos = jnp.sum(jnp.where(found, normal_cos, 0.0), axis=-1) / jnp.maximum(jnp.sum(found, axis=-1), 1)
@@ -182,9 +182,9 @@ def _explain(
 
 
 def support(gaussians: Gaussians, points: Observation, step: EStep, config: EmConfig) -> Float[Array, "n"]:
-    """δ_k in [0, 1]: how evenly the points lie on both sides of the Gaussian along its tangential principal axes.
+    """Compute δ_k in [0, 1]: how evenly points lie on both sides of a Gaussian along its tangential principal axes.
 
-    For each axis 2 min(Σ₊ r, Σ₋ r), over the total or clipped (R5); the smaller of the two axes.
+    For each axis 2 min(Σ₊ r, Σ₋ r), divided by the total or clipped (R5); δ is the smaller value of the two axes.
     """
     basis = tangent_basis(gaussians.normals)
     plane_covs = jnp.einsum("nda,ndc,ncb->nab", basis, gaussians.covs, basis)
@@ -213,12 +213,12 @@ def precision(noise: Float[Array, "m 3"], config: EmConfig) -> Float[Array, "m"]
 def m_step(
     gaussians: Gaussians, points: Observation, weights: Float[Array, "m"], step: EStep, config: EmConfig
 ) -> tuple[Gaussians, Float[Array, "n"]]:
-    """Responsibility-weighted mean, covariance about it, normal and colour of the points of every Gaussian.
+    """Compute mean, covariance, normal and colour of the points of every Gaussian, weighted by responsibility.
 
     A point counts r_ik times its weight, see `precision`.
 
     Returns:
-        The new parameters (the old ones where no point is), and the total responsibility Σ_i r_ik.
+        The new parameters (the old ones for a Gaussian without points), and the total responsibility Σ_i r_ik.
     """
     blocks = take_rows((points, weights), step.near.queries)
     sums = _statistics(gaussians.means[step.near.rows], *blocks, step.responsibilities)
@@ -248,7 +248,7 @@ def _statistics(
     weights: Float[Array, "b q"],
     responsibilities: Float[Array, "b q c"],
 ) -> Float[Array, "b c 17"]:
-    """Σ r and Σ r w (1, offset, upper triangle of offset offset', normal, colour) over the points of every block."""
+    """Sum r and r w (1, offset, upper triangle of offset offset', normal, colour) over the points of every block."""
     weighted = responsibilities * weights[..., None]
     # Offsets from the old means: second moments of world coordinates would cancel in float32.
     offsets = between(points.points, means)
@@ -260,7 +260,7 @@ def _statistics(
 
 
 def _with_features(submap: GaussianMap, points: Observation, step: EStep, config: EmConfig) -> GaussianMap:
-    """Add the feature of each point, which may be wide, to that of the Gaussian that explains it best."""
+    """Add each point's feature, which may be wide, to the Gaussian that explains the point best."""
     features = submap.gaussians.features
     owner = owners(step, features.shape[0])[:, None]
     said = gathered_features(points.features, owner, config.feature * jnp.ones(owner.shape), features.shape[0])
@@ -276,13 +276,13 @@ def em_update(
     index: GaussianIndex | None = None,
     e_step: Callable[..., tuple[EStep, Array]] = _e_step,
 ) -> tuple[GaussianMap, EStep, EmInfo]:
-    """One incremental EM step: fuse the points of `aligned` (world frame) that the submap explains.
+    """Do one incremental EM step: fuse the points of `aligned` (world frame) that the submap explains.
 
     `noise` is the standard deviation of each point along its viewing ray, a vector in metres;
-    `index` as in `e_step`, in whose place another function may stand.
+    `index` is that of the submap. Another function can replace `e_step`.
 
     Returns:
-        The updated submap, what explains which point, and counts. Without any fused point the submap is unchanged.
+        The updated submap, the data association, and statistics. Without any fused point the submap is unchanged.
     """
     gaussians, (aligned, noise) = submap.gaussians, _sound(aligned, noise)
     index = index_of(gaussians) if index is None else index

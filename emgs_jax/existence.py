@@ -26,30 +26,29 @@ from emgs_jax.ops.neighbours import group_points, nearest, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
 
-MIN_GAP = 2.0  # standard deviations along the normal; what is nearer is one sheet, as thick as it is
+MIN_GAP = 2.0  # standard deviations along the normal; two Gaussians closer than this are one thick sheet
 
 
 class ExistenceConfig(eqx.Module):
     """Evidence of frames for and against the existence of Gaussians, and merging of duplicate surfaces.
 
     Args:
-        birth: log-odds of a new Gaussian. At 0 it is tentative until it explains points of another frame; above, as
-            printed, it is not.
+        birth: log-odds of a new Gaussian. At 0 it is tentative until it explains points of another frame; above 0, as
+            printed, it is confirmed at once.
         hit: log-odds that a frame adds if the Gaussian explains some of its points.
-        miss: log-odds that a frame takes away that sees through the Gaussian (free-space violation), or whose points it
-            does not explain.
-        max_log_odds: upper limit, so that a bounded number of frames can outweigh any number of earlier ones.
+        miss: log-odds that a frame subtracts if it sees through the Gaussian (free-space violation), or if the Gaussian
+            explains none of its points.
+        max_log_odds: upper limit, so that a bounded number of frames outweighs any number of earlier ones.
         refuted: log-odds below which a Gaussian is removed; `-inf` never, as printed.
         num_std: k, standard deviations of the depth between a Gaussian and the surface that a frame sees, within which
             it counts as seen.
         min_cos: between its normal and the ray; in a more grazing view it is neither seen nor seen through.
-        num_neighbours: nearest seen Gaussians among which a duplicate surface is searched.
-        max_mahalanobis_sq: between two Gaussians that are one, the frame's noise along the normal included; 0 merges
+        num_neighbours: nearest seen Gaussians among which a duplicate is searched.
+        max_mahalanobis_sq: between two Gaussians that merge, the frame's noise along the normal included; 0 merges
             none, as printed.
-        max_layer_sq: likewise between two of which one stands behind the other, see `nearest_duplicates`.
+        max_layer_sq: likewise if one stands behind the other, see `nearest_layer`.
         min_normal_cos: between their normals.
-        feature: of the merged Gaussian: that of the heavier (`medoid`), or the sum of both (`accumulated`), see
-            `EmConfig`.
+        feature: of the merged Gaussian: that of the heavier one (`medoid`) or the sum (`accumulated`), see `EmConfig`.
     """
 
     birth: Float[Array, "*b"] = traced(low=-1e6)
@@ -67,11 +66,11 @@ class ExistenceConfig(eqx.Module):
 
 
 class Look(NamedTuple):
-    """A frame as evidence.
+    """A frame as evidence for and against Gaussians.
 
     Args:
-        view: as it was aligned, world frame; a frame that is not tracked has no valid row.
-        T_world_camera: from where it was seen.
+        view: its aligned points, world frame; a frame that is not tracked has no valid row.
+        T_world_camera: its pose.
         camera: of its rows.
         depth_noise: of its points, as a fraction of their depth.
     """
@@ -83,14 +82,14 @@ class Look(NamedTuple):
 
 
 class Seen(NamedTuple):
-    """An earlier frame, in which later ones have found what moves.
+    """An earlier frame, in which later frames have found what moves.
 
     Args:
-        depth: nearest and farthest z (m) round each pixel, 0 where it has none.
-        moves: pixels that were taken for static when it was mapped, and have moved.
-        T_world_camera: from where it was seen, as is known by now.
+        depth: nearest and farthest z (m) around each pixel, 0 where it has none.
+        moves: pixels that were taken for static when the frame was mapped, and have moved.
+        T_world_camera: its pose, by the latest estimate.
         depth_noise: of its points, as a fraction of their depth.
-        time: of the frame; -1 where there is none.
+        time: of the frame; -1 without one.
     """
 
     depth: Float[Array, "2 p"]
@@ -101,7 +100,7 @@ class Seen(NamedTuple):
 
 
 def fusion_evidence(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> Int[Array, "n"]:
-    """Return a frame's evidence for every Gaussian: 1 with points fused into it, -1 without, 0 outside the submap.
+    """Return a frame's evidence for every Gaussian: 1 if it fused points into it, -1 if not, 0 outside the submap.
 
     Args:
         map: before the frame.
@@ -120,19 +119,19 @@ def update_existence(
 ) -> tuple[GaussianMap, Bool[Array, "n"]]:
     """Update the existence (log-odds) of every Gaussian by one more frame; refuted Gaussians become free rows.
 
-    With d the depths that the frame shows round the Gaussian's pixel, z its own and σ² = (depth_noise · z)² + n'Σn, it
-    is seen where |z - min d| <= kσ or |z - max d| <= kσ, and seen through (free-space violation) where z < min d - kσ.
-    A Gaussian behind is occluded, and one between, at an edge, may be either: that is no evidence.
+    Let d be the depths that the frame shows around the Gaussian's pixel, z its own and σ² = (depth_noise · z)² + n'Σn.
+    It is seen if |z - min d| <= kσ or |z - max d| <= kσ, and seen through (free-space violation) if z < min d - kσ. A
+    Gaussian behind is occluded, and one in between, at an edge, may be either: neither is evidence.
 
-    Unless it is seen through, points that it explains confirm it, however grazing the view and however near an edge:
-    the depth round its pixel shows nothing there, and a floor behind a table would never be confirmed. A Gaussian that
-    is seen while others explain all points there is redundant, like the second layer of a wall: that is evidence
-    against it, or a map would grow for as long as a camera looks at it. A confirmed one counts as redundant only if it
-    is as wide as a pixel: a view from afar has no point for each.
+    Unless it is seen through, points that it explains confirm it, however grazing the view and however near an edge.
+    There the depth around its pixel shows nothing, and a floor behind a table would never be confirmed. A Gaussian that
+    is seen while others explain all points there is redundant, like the second layer of a wall. That is evidence
+    against it; otherwise a map would grow as long as a camera looks at it. A confirmed Gaussian counts as redundant
+    only if it is as wide as a pixel: a view from afar does not have a point for each.
 
     Args:
         map: all Gaussians, world frame.
-        use: evidence of this frame's points for each, see `fusion_evidence`.
+        use: evidence of this frame's points, see `fusion_evidence`.
         look: the frame.
 
     Returns:
@@ -157,9 +156,9 @@ def update_existence(
 
 @full_precision
 def take_back(map: GaussianMap, seen: Seen, camera: Camera, config: ExistenceConfig) -> GaussianMap:
-    """Take back what an earlier frame has said for Gaussians that it saw where, as is known by now, something moved.
+    """Withdraw an earlier frame's evidence for Gaussians in pixels that are now known to have moved.
 
-    It counts as one that did not explain them: `hit` is taken back and `miss` taken away.
+    The frame then counts as one that did not explain them: `hit` is withdrawn and `miss` subtracted.
 
     Args:
         camera: of the frame's rows.
@@ -180,10 +179,10 @@ def _sight(
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
 ) -> tuple[Int[Array, "n"], Bool[Array, "n"], Bool[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
-    """Of each Gaussian its pixel, whether it is seen there, and seen through; its depth, and variance along its normal.
+    """Find each Gaussian's pixel, whether it is seen or seen through there, its depth, and variance along its normal.
 
     Args:
-        depths: that a frame shows round each pixel, see `depth_range`.
+        depths: that a frame shows around each pixel, see `depth_range`.
     """
     rotation = T_world_camera.rotation().as_matrix()
     rays = gaussians.means - T_world_camera.translation()
@@ -207,14 +206,14 @@ def merge_duplicates(
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
 ) -> GaussianMap:
-    """Merge duplicate surfaces: every two Gaussians that a frame cannot tell apart and that are each other's nearest.
+    """Merge duplicate surfaces: pairs of Gaussians that a frame cannot tell apart and that are each other's nearest.
 
     Means, covariances, colours and normals are averaged by the Gaussians' weights. The covariance grows by the spread
-    of the means along the surface only: a wall does not become thicker by being two layers.
+    of the means only along the surface: two layers must not make a wall thicker.
 
     Args:
-        is_seen: Gaussians that may be joined.
-        origins: of the camera of the frame, world frame; one for all, or one for each.
+        is_seen: Gaussians that may merge.
+        origins: camera centre of the frame, world frame; one for all Gaussians, or one for each.
         depth_noise: as a fraction of the depth.
     """
     partner, is_pair = nearest_duplicates(map, is_seen, origins, depth_noise, config)
@@ -240,13 +239,13 @@ def merge_duplicates(
 def merge_all_duplicates(
     map: GaussianMap, origins: Float[Array, "n 3"], depth_noise: Float[Array, ""], config: ExistenceConfig
 ) -> GaussianMap:
-    """Join the layers of a whole map that has moved, until none are left that are each other's nearest.
+    """Merge the duplicates of a whole map after it has moved, until no pair of mutual nearest layers is left.
 
-    Two visits that come to lie on each other are not observed again: each Gaussian is seen from where it was made.
+    When two visits come to lie on each other no frame observes them, so each Gaussian is judged from where it was made.
 
     Args:
         map: all Gaussians, world frame.
-        origins: of the camera by which each was made, world frame.
+        origins: centre of the camera that made each, world frame.
         depth_noise: as a fraction of the depth.
         config: gates; with `max_mahalanobis_sq` and `max_layer_sq` 0 the map stays as it is.
     """
@@ -269,7 +268,7 @@ def nearest_duplicates(
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
 ) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
-    """The nearest other layer of every Gaussian, and whether it is that one's nearest, too."""
+    """Find the nearest other layer of every Gaussian, and whether the two are each other's nearest."""
     partner, has_layer = nearest_layer(map, is_seen, is_seen, origins, depth_noise, config)
     return partner, has_layer & has_layer[partner] & (partner[partner] == jnp.arange(partner.shape[0]))
 
@@ -282,12 +281,12 @@ def nearest_layer(
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
 ) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
-    """The nearest other layer of every Gaussian asked, among the known ones, and whether there is one.
+    """Find the nearest other layer of every Gaussian in `is_asked` among those in `is_known`, and whether there is one.
 
-    The squared distance of the means is taken under Σ_a + Σ_b + ν²nn', where ν is the noise of the frame along the
-    normal n of the Gaussian itself: a frame cannot tell the two apart. Where one stands behind the other, by more
-    than `MIN_GAP` standard deviations of either, they may be two sheets of one surface that different frames made, each
-    with its own error. Then it is taken under ν² (1 / W_a + 1 / W_b), what the means of so many frames differ by.
+    The squared distance of the means is measured with Σ_a + Σ_b + ν²nn', where ν is the frame's noise along the normal
+    n of the Gaussian: within it, a frame cannot tell the two apart. If one stands behind the other by more than
+    `MIN_GAP` standard deviations of either, they may be two sheets of one surface from different frames, each with its
+    own error. Then the distance is measured with ν² (1 / W_a + 1 / W_b), the variance between means of so many frames.
     """
     gaussians, count = map.gaussians, is_asked.shape[0]
     groups = group_points(gaussians.means, is_known)
@@ -298,7 +297,7 @@ def nearest_layer(
     frames = jnp.maximum(map.weight, 1.0)
 
     def distance_to(one: tuple[Int[Array, "n"], Bool[Array, "n"]]) -> Float[Array, "n"]:
-        """Squared distance to one neighbour of each; infinite where that is no other layer."""
+        """Measure the squared distance to one neighbour of each; infinite if that is no other layer."""
         rows, found = one
         near_covs, near_normals = (tuple(entry[rows] for entry in entries) for entries in (covs, normals))
         offsets = jnp.unstack(gaussians.means[rows] - gaussians.means, axis=-1)
@@ -318,14 +317,14 @@ def nearest_layer(
         is_layer = found & is_asked & (rows != jnp.arange(count)) & is_one & is_alike
         return jnp.where(is_layer, distance_sq, jnp.inf)
 
-    # In a loop, or XLA would do all of it again for everything that is asked of the distances.
+    # In a loop; otherwise XLA computes all of it again for every use of the distances.
     distance_sq = jax.lax.map(distance_to, (rows.T, found.T))
     partner = jnp.take_along_axis(rows, jnp.argmin(distance_sq, axis=0)[:, None], axis=1)[:, 0]
     return partner, jnp.min(distance_sq, axis=0) < jnp.inf
 
 
 def along_surface(offsets: Float[Array, "*b 3"], normals: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
-    """The part of each offset that is at right angles to its normal."""
+    """Project each offset onto the plane orthogonal to its normal."""
     return offsets - _inner(offsets, normals)[..., None] * normals
 
 

@@ -1,4 +1,4 @@
-"""The map M: Gaussians of fixed capacity with the weight of their running average, and its submaps."""
+"""The map M: Gaussians in arrays of fixed capacity with the weights of their running averages, and its submaps."""
 
 import math
 from dataclasses import fields, replace
@@ -24,10 +24,10 @@ class GaussianMap(eqx.Module):
         gaussians: world frame.
         weight: what eq. 4 keeps per Gaussian: α_{t-1} for the printed gain, the accumulated support for `count` (R4).
         num_updates: how often EM or refinement fused something into it, at most twice a frame.
-        existence: log-odds of there being what it stands for. A positive one is confirmed; any other is tentative: it
-            is fused into, but neither aligned against nor exported.
-        birth: `SlamState.time` of the frame that it was made from. What moves that frame moves it, too: later frames
-            were placed by it.
+        existence: log-odds that its surface exists. Above 0 it is confirmed; otherwise it is tentative: frames are
+            fused into it, but not aligned against it, and it is not exported.
+        birth: `SlamState.time` of the frame that made it. It moves with that frame, because later frames were
+            registered to it.
     """
 
     gaussians: Gaussians
@@ -44,8 +44,8 @@ class AverageConfig(eqx.Module):
         gain: `ema_printed`, α_t = δ / (α_{t-1} + δ), an exponential average; or `count`, W += δ, α = δ / W, which tends
             to the mean of all frames (R4; West 1979).
         forgetting: factor on the kept α or W before each update; 1 = the printed form.
-        max_weight: upper limit of the kept α or W, so that a camera that stands still does not become certain: errors
-            that its predictions have in common do not average out. `inf` as printed.
+        max_weight: upper limit of the kept α or W, so that a still camera does not make the map certain: errors that
+            its predictions share do not average out. `inf` as printed.
         blend: of covariances: `linear` (printed) or `moment_matched` (R13).
     """
 
@@ -60,9 +60,9 @@ class SubmapConfig(eqx.Module):
 
     Args:
         voxel_size: m; Gaussians are looked up by the voxel of their mean.
-        margin: m; by which the box round the previous cloud is grown.
-        map_capacity: rows of the map at the start; doubled when it is full.
-        submap_capacity: rows of a submap at the start; likewise.
+        margin: m; added around the box of the previous cloud.
+        map_capacity: initial rows of the map; doubled when it is full.
+        submap_capacity: initial rows of a submap; likewise.
     """
 
     voxel_size: Float[Array, "*b"] = traced(0.1, low=1e-6, high=1000)
@@ -72,7 +72,7 @@ class SubmapConfig(eqx.Module):
 
 
 def empty_map(capacity: int, num_features: int) -> GaussianMap:
-    """A map without a Gaussian."""
+    """Make a map without Gaussians."""
     nothing, none = jnp.zeros(capacity), jnp.zeros(capacity, jnp.int32)
     return GaussianMap(empty_gaussians(capacity, num_features), nothing, none, nothing, none)
 
@@ -80,14 +80,14 @@ def empty_map(capacity: int, num_features: int) -> GaussianMap:
 def new_map(
     gaussians: Gaussians, weight: Float[Array, "n"], existence: Float[Array, ""], birth: Int[Array, ""]
 ) -> GaussianMap:
-    """A map of Gaussians that are new, all with the same log-odds of existence and from the same frame."""
+    """Make a map of new Gaussians, all with the same log-odds of existence and from the same frame."""
     num_updates = jnp.ones(weight.shape, jnp.int32)
     existence, birth = (jnp.broadcast_to(value, weight.shape) for value in (existence, birth))
     return GaussianMap(gaussians, weight, num_updates, existence, birth)
 
 
 def confirmed(map: GaussianMap) -> Gaussians:
-    """The Gaussians with only the confirmed ones valid."""
+    """Return the Gaussians, of which only the confirmed ones are valid."""
     return eqx.tree_at(lambda g: g.valid, map.gaussians, map.gaussians.valid & (map.existence > 0))
 
 
@@ -99,13 +99,13 @@ def transform_rows(
     scale: Float[Array, "*#n"],
     min_std: Float[Array, ""] | float = 0.0,
 ) -> GaussianMap:
-    """Apply a similarity to each Gaussian, one or its own: Σ' = s² R (Σ - min_std² I) Rᵀ + min_std² I.
+    """Apply a similarity, common or one for each Gaussian: Σ' = s² R (Σ - min_std² I) Rᵀ + min_std² I.
 
     Args:
-        means: where the similarities bring the means, world frame.
+        means: the transformed means, world frame.
         turn: R.
         scale: s.
-        min_std: m; floor of the covariances that is no length of the scene, as deformed maps have one.
+        min_std: m; floor of the covariances that does not scale with the scene, as in deformed maps; else 0.
 
     Raises:
         KeyError: a field of the map has no rule here.
@@ -114,7 +114,7 @@ def transform_rows(
     def shapes(covs: Float[Array, "n 3 3"]) -> Float[Array, "n 3 3"]:
         floor = min_std**2 * jnp.eye(3)
         turned = jnp.einsum("...ij,...jk,...lk->...il", turn, covs - floor, turn)
-        return scale[..., None, None] ** 2 * (0.5 * (turned + turned.mT)) + floor  # as equal as roundings were not
+        return scale[..., None, None] ** 2 * (0.5 * (turned + turned.mT)) + floor  # symmetric despite rounding
 
     def same(values: Array) -> Array:
         return values
@@ -149,11 +149,11 @@ def without(map: GaussianMap, is_gone: Bool[Array, "n"]) -> GaussianMap:
 def update_average(
     map: GaussianMap, new: Gaussians, evidence: Float[Array, "n"], config: AverageConfig
 ) -> tuple[GaussianMap, Float[Array, "n"]]:
-    """(1 - α) M + α M_new with the gain α = δ / (min(forgetting · w, max_weight) + δ) of every Gaussian (eq. 4).
+    """Average (1 - α) M + α M_new with the gain α = δ / (min(forgetting · w, max_weight) + δ) of each Gaussian (eq. 4).
 
     Args:
-        new: parameters that this frame suggests, row by row.
-        evidence: δ >= 0; a Gaussian without any is left as it is, bit for bit.
+        new: parameters from this frame, row by row.
+        evidence: δ >= 0; with 0 a Gaussian stays the same, bit for bit.
 
     Returns:
         The map and the gain.
@@ -169,13 +169,13 @@ def update_average(
 def select_submap(
     map: GaussianMap, clouds: tuple[Observation, ...], config: SubmapConfig
 ) -> tuple[GaussianMap, Int[Array, "s"], Int[Array, ""]]:
-    """The Gaussians whose voxel lies in the bounding box of the valid points of `clouds`, world-frame observations.
+    """Select the Gaussians whose voxel lies in the bounding box of the valid points of `clouds` (world frame).
 
-    The paper takes the box of the previous frame's cloud. With wide baselines that misses what only the current frame
-    sees, so the step gives both, the current one at its coarse pose.
+    The paper uses the box of the previous frame's cloud. With wide baselines that misses what only the current frame
+    sees, so the step passes both, the current one at its coarse pose.
 
     Returns:
-        The submap, its rows in the map (map capacity where there is none), and how many Gaussians did not fit.
+        The submap, its rows in the map (the map's capacity for empty ones), and how many Gaussians did not fit.
     """
     points = jnp.concatenate([cloud.points for cloud in clouds])
     valid = jnp.concatenate([cloud.valid for cloud in clouds])[:, None]
@@ -189,7 +189,7 @@ def select_submap(
 
 
 def write_back(map: GaussianMap, submap: GaussianMap, rows: Int[Array, "s"]) -> GaussianMap:
-    """Put the rows of a submap back into the map that it was taken from."""
+    """Write the rows of a submap back into its map."""
     return put_rows(map, rows, submap)
 
 
@@ -210,7 +210,7 @@ def insert(map: GaussianMap, new: GaussianMap) -> tuple[GaussianMap, Int[Array, 
 
 
 def grow(map: GaussianMap, capacity: int) -> GaussianMap:
-    """The same map, or stack of maps, with room for `capacity` Gaussians (host side: the shape changes)."""
+    """Grow a map, or a stack of maps, to `capacity` rows (on the host: the shape changes)."""
     stacked = map.weight.shape[:-1]
     free = empty_map(capacity - map.weight.shape[-1], map.gaussians.features.shape[-1])
 

@@ -30,7 +30,7 @@ LUMINANCE = (0.299, 0.587, 0.114)  # ITU-R BT.601
 
 
 class Gaussians(eqx.Module):
-    """A set of Gaussians in the world frame. Invalid rows are neutral: origin, unit covariance, zero normal."""
+    """Gaussians in the world frame. Invalid rows are neutral: origin, unit covariance, zero normal."""
 
     means: Float[Array, "*b n 3"]  # μ, m
     covs: Float[Array, "*b n 3 3"]  # Σ, m²; every eigenvalue is at least min_std²
@@ -41,7 +41,7 @@ class Gaussians(eqx.Module):
 
 
 class GaussianIndex(eqx.Module):
-    """Index of Gaussians: what a search in them and their distances to them, made once for all stages."""
+    """Search index of Gaussians, built once for all stages."""
 
     white: Whitening  # of the covariances
     groups: Groups  # of the means of the valid ones
@@ -68,12 +68,12 @@ class FitConfig(eqx.Module):
     """Conversion of points into Gaussians: number of clusters, clustering and covariances.
 
     Args:
-        points_per_gaussian: λ, in pixels of an image of 518 × 392, the paper's; a new Gaussian stands for so many. An
-            image of another size is cut into as many pieces, but none of fewer than MIN_ROWS points.
+        points_per_gaussian: λ, pixels per new Gaussian, counted in an image of the paper's size, 518 × 392. An image of
+            another size is cut into as many pieces, but none of fewer than MIN_ROWS points.
         num_fit_neighbours: M of eq. 1 (R10).
         min_std: m; floor of a Gaussian's standard deviation in every direction.
-        feature: the `medoid` of the points' features (printed), or their sum, to which EM and refinement add what
-            other frames say: `accumulated` evidence (R16).
+        feature: the `medoid` of the points' features (printed), or `accumulated`: their sum, to which EM and refinement
+            add those of other frames (R16).
     """
 
     points_per_gaussian: int = static(low=1, high=2**20)
@@ -84,7 +84,7 @@ class FitConfig(eqx.Module):
 
 
 def spacing(camera: Camera, thin: int, config: FitConfig) -> int:
-    """Rows of a thinned observation that make one Gaussian, which are λ pixels of an image of 518 × 392."""
+    """Compute how many rows of a thinned observation make one Gaussian: λ pixels of an image of 518 × 392."""
     share = camera.width * camera.height / REFERENCE
     return max(round(config.points_per_gaussian * share / thin**2), MIN_ROWS)
 
@@ -93,10 +93,10 @@ def spacing(camera: Camera, thin: int, config: FitConfig) -> int:
 def fit_to_points(
     centers: Float[Array, "k 3"], exists: Bool[Array, "k"], observation: Observation, config: FitConfig
 ) -> Gaussians:
-    """Eq. 1: covariance, normal, feature and colour of each centre from its M nearest points.
+    """Fit covariance, normal, feature and colour of each centre to its M nearest points (eq. 1).
 
-    The covariance has min_std² added on the diagonal, which keeps every eigenvalue at or above the floor. A centre
-    with fewer than four points becomes invalid.
+    min_std² is added to the diagonal of the covariance, so every eigenvalue is at least that. A centre with fewer than
+    four points becomes invalid.
     """
     return _fit_to_sound(centers, exists, sound(observation), config)
 
@@ -106,10 +106,10 @@ def _fit_to_sound(
 ) -> Gaussians:
     points, num = observation.points, config.num_fit_neighbours
     groups = group_points(points, observation.valid)
-    # A centre stands for several points: few centres share a list, and that is long.
+    # A centre stands for several points, so few centres share a list and the list is long.
     rows, found = nearest(centers, exists, points, groups, num, size=4, count=6 * num)
     valid = exists & (jnp.sum(found, axis=-1) >= 4)
-    found |= ~valid[:, None]  # a softmax over nothing would be NaN; these rows are replaced below
+    found |= ~valid[:, None]  # a softmax over nothing would be NaN; these rows are masked below
     near = jax.tree.map(lambda leaf: leaf[rows], observation)
     count = jnp.maximum(jnp.sum(found, axis=-1), 1)[:, None]
     offsets = jnp.where(found[..., None], near.points - centers[:, None], 0.0)
@@ -138,11 +138,11 @@ def _fit_to_sound(
 def cluster(
     observation: Observation, order: Int[Array, "p"], spacing: int, config: FitConfig
 ) -> tuple[Gaussians, Float[Array, "g"]]:
-    """Gaussians of the valid points: k-means from every `spacing`-th point along `order`, then eq. 1.
+    """Cluster the valid points into Gaussians: k-means from every `spacing`-th point along `order`, then eq. 1.
 
-    The M neighbours of eq. 1 are taken from an even choice of the points in which a cluster has about M of them, so
-    that a Gaussian is as large as its cluster whatever the number of merged images is. Compiled by itself, because the
-    first map and every step share it.
+    The M neighbours of eq. 1 come from an even subset of the points, in which a cluster has about M of them. So a
+    Gaussian is as large as its cluster, however many images were merged. Compiled on its own, because the first map and
+    every step share it.
 
     Returns:
         ceil(p / spacing) Gaussians, and the number of points of each in units of `spacing`; 0 where invalid.
@@ -165,11 +165,11 @@ def cluster(
 
 
 def blend(old: Gaussians, new: Gaussians, gain: Float[Array, "n"], moment_matched: Float[Array, ""]) -> Gaussians:
-    """(1 - gain) old + gain new on means, covariances, colours and normals (eq. 4 and 6); features stay (R13).
+    """Blend means, covariances, colours and normals: (1 - gain) old + gain new (eq. 4 and 6); features stay (R13).
 
     Args:
-        moment_matched: 0 = the printed linear blend of covariances; 1 adds gain (1 - gain) Δ Δ' for the means'
-            difference Δ, which makes it the covariance of the moment-matched mixture.
+        moment_matched: 0 = the printed linear blend of covariances; 1 adds gain (1 - gain) Δ Δ' for the difference Δ of
+            the means, which gives the covariance of the moment-matched mixture.
     """
     weight = gain[:, None]
     difference = new.means - old.means
@@ -187,27 +187,27 @@ def blend(old: Gaussians, new: Gaussians, gain: Float[Array, "n"], moment_matche
 
 
 def has_feature(features: Float[Array, "*b f"]) -> Bool[Array, "*b"]:
-    """False where a feature is missing (zero), which then says neither yes nor no."""
+    """Tell which features exist; a missing one is zero and counts as neither similar nor different."""
     return jnp.any(features != 0, axis=-1)
 
 
 def gathered_features(
     features: Float[Array, "m f"], rows: Int[Array, "m k"], weights: Float[Array, "m k"], num_rows: int
 ) -> Float[Array, "n f"]:
-    """Weighted sum of the features that go to each of n rows; a row number past the end is dropped."""
+    """Sum the weighted features of each of n rows; row numbers past the end are dropped."""
     sums = jnp.zeros((num_rows, features.shape[-1]))
     return sums.at[rows].add(weights[..., None] * features[:, None], mode="drop")
 
 
 def intensity(colors: Float[Array, "*b 3"]) -> Float[Array, "*b"]:
-    """Luminance of RGB."""
+    """Convert RGB to luminance."""
     return colors @ jnp.array(LUMINANCE, colors.dtype)
 
 
 def color_gradients(gaussians: Gaussians, num_neighbours: int, groups: Groups | None = None) -> Float[Array, "n 3"]:
-    """Intensity gradient (1/m) of every Gaussian in its tangent plane, fitted to its neighbours; orthogonal to n.
+    """Fit the intensity gradient (1/m) of every Gaussian in its tangent plane to its neighbours; orthogonal to n.
 
-    `groups` are those of the valid means, see `group_points`; None makes them here.
+    `groups` are those of the valid means, see `group_points`; None builds them here.
     """
     means, valid = gaussians.means, gaussians.valid
     groups = group_points(means, valid) if groups is None else groups
@@ -218,7 +218,7 @@ def color_gradients(gaussians: Gaussians, num_neighbours: int, groups: Groups | 
     light = intensity(gaussians.colors)
     moments = jnp.einsum("nka,nkb->nab", offsets, offsets)
     cross = jnp.einsum("nka,nk->na", offsets, light[rows] - light[:, None])
-    # A hundredth of the spread keeps the fit of collinear neighbours finite, and of coincident ones the own widths do.
+    # A hundredth of the spread keeps the fit of collinear neighbours finite, the own widths that of coincident ones.
     own = jnp.trace(gaussians.covs, axis1=-2, axis2=-1)
     ridge = 0.01 * jnp.trace(moments, axis1=-2, axis2=-1) + 1e-5 * own
     slopes = (inverse_2x2(moments + ridge[:, None, None] * jnp.eye(2)) @ cross[..., None])[..., 0]

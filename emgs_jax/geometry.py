@@ -17,12 +17,12 @@ class Sim3:
 
     @classmethod
     def about(cls, center: Float[np.ndarray, "3"], scale: float) -> "Sim3":
-        """Scale all lengths about a point, which stays."""
+        """Scale all lengths about a point, which stays in place."""
         return cls(scale, np.eye(3), center - scale * center)
 
     @classmethod
     def from_matrix(cls, matrix: Float[np.ndarray, "4 4"]) -> "Sim3":
-        """Read a matrix with scale · rotation in the place of a rotation."""
+        """Read a (4, 4) matrix with scale · rotation in place of the rotation."""
         scale = float(np.cbrt(np.linalg.det(matrix[:3, :3])))
         return cls(scale, matrix[:3, :3] / scale, matrix[:3, 3])
 
@@ -37,7 +37,7 @@ class Sim3:
         return rotated(self.scale * points, self.rotation) + self.translation
 
     def apply_to_poses(self, poses: Float[np.ndarray, "*n 4 4"]) -> Float[np.ndarray, "*n 4 4"]:
-        """Map camera poses; the result stays rigid, the scale acts on the positions only."""
+        """Map camera poses; they stay rigid, and the scale acts on their positions only."""
         moved = np.array(poses, np.float64)
         moved[..., :3, :3] = self.rotation @ moved[..., :3, :3]
         moved[..., :3, 3] = self.apply(moved[..., :3, 3])
@@ -54,19 +54,19 @@ class Sim3:
 
 
 def rotated(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
-    """R v of each vector (..., 3). Not by BLAS: its threads wait for each other longer than so thin a product takes."""
+    """Rotate each vector (..., 3). Not by BLAS, whose threads wait longer than so small a product takes."""
     return np.einsum("ij,...j->...i", rotation, vectors)
 
 
 def scale_covariance(covariance: np.ndarray, scale: float) -> np.ndarray:
-    """Covariance of (translation, rotation, ...), (..., d, d), after lengths are multiplied by `scale`."""
+    """Convert a covariance of (translation, rotation, ...), (..., d, d), after lengths are multiplied by `scale`."""
     units = np.ones(covariance.shape[-1])
     units[:3] = scale
     return units[:, None] * covariance * units
 
 
 def adjoint(T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6 6"]:
-    """Ad of poses: T Exp(xi) = Exp(Ad xi) T, translation first."""
+    """Compute the adjoint of poses: T Exp(xi) = Exp(Ad xi) T, translation first."""
     rotations, across = T[:, :3, :3], np.cross(T[:, None, :3, 3], T[:, :3, :3], axisb=1, axisc=1)
     return np.block([[rotations, across], [np.zeros_like(rotations), rotations]])
 
@@ -74,13 +74,13 @@ def adjoint(T: Float[np.ndarray, "n 4 4"]) -> Float[np.ndarray, "n 6 6"]:
 def seen_from(
     covariance: Float[np.ndarray, "6 6"], T_world_there: Float[np.ndarray, "4 4"], T_world: Float[np.ndarray, "n 4 4"]
 ) -> Float[np.ndarray, "n 6 6"]:
-    """Covariances of other poses that err with the one there as one rigid body: Ad Σ Adᵀ, each in its own axes."""
+    """Carry a pose's covariance to others that move with it as one rigid body: Ad Σ Adᵀ, each in its own axes."""
     adjoints = adjoint(np.linalg.inv(T_world) @ T_world_there)
     return adjoints @ covariance @ adjoints.transpose(0, 2, 1)
 
 
 def scale_pose(T: Float[np.ndarray, "4 4"], scale: float) -> Float[np.ndarray, "4 4"]:
-    """Return a pose with its translation in other units."""
+    """Multiply the translation of a pose by `scale`."""
     return np.block([[T[:3, :3], scale * T[:3, 3:]], [T[3:]]])
 
 
@@ -92,6 +92,6 @@ def transform_points(T: Float[np.ndarray, "4 4"], points: Float[np.ndarray, "n 3
 def pose_difference(
     T: Float[np.ndarray, "*n 4 4"], other: Float[np.ndarray, "*n 4 4"]
 ) -> tuple[Float[np.ndarray, "*n"], Float[np.ndarray, "*n"]]:
-    """Distance of two camera centres, and the angle between the cameras in degrees; of one pair or of n."""
+    """Compute the distance of two camera centres and the angle between the cameras in degrees; for one pair or n."""
     angle = Rotation.from_matrix(T[..., :3, :3].mT @ other[..., :3, :3]).magnitude()
     return np.linalg.norm(T[..., :3, 3] - other[..., :3, 3], axis=-1), np.degrees(angle)

@@ -18,9 +18,9 @@ from emgs_jax.ops.precision import full_precision
 def merge(
     views: Observation, T_world_views: jaxlie.SE3, camera: Camera
 ) -> tuple[Observation, Observation, Int[Array, "q"]]:
-    """The views in the world frame, the same as one cloud of q points, and an order that is even over every image.
+    """Merge the views: in the world frame, as one cloud of q points, and an order that is even over every image.
 
-    A view without a pose has no point.
+    A view without a pose contributes no point.
     """
     T_world_views, views = sound_poses(T_world_views), jax.vmap(sound)(views)
     is_known = jnp.all(jnp.isfinite(T_world_views.wxyz_xyz), axis=-1)

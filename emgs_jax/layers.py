@@ -1,4 +1,4 @@
-"""Layers: two maps of one scene err each by itself, so one stands before or behind the other until they are one."""
+"""Layers: two maps of one scene have independent errors, so their surfaces lie apart until they are made one layer."""
 
 from dataclasses import replace
 
@@ -14,7 +14,7 @@ from emgs_jax.ops.neighbours import knn
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import where_rows
 
-MAX_APART_SQ = 9.0  # squared Mahalanobis distance of two layers of one surface, the noise of a frame included
+MAX_APART_SQ = 9.0  # squared Mahalanobis distance between layers of one surface, a frame's noise included
 
 
 @full_precision
@@ -25,12 +25,12 @@ def one_layer(
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
 ) -> GaussianMap:
-    """Make one layer of two maps that lie on each other: move both together, and fuse the other into the first.
+    """Make one layer of two maps that lie on each other: move both together, then fuse the second into the first.
 
     Args:
-        map: both, world frame.
-        is_other: the Gaussians of the other one.
-        origins: of the camera by which each was made, world frame.
+        map: the Gaussians of both, world frame.
+        is_other: the Gaussians of the second map.
+        origins: centre of the camera that made each, world frame.
         depth_noise: as a fraction of the depth.
         config: gates; with `max_layer_sq` 0 the map stays as it is.
     """
@@ -44,10 +44,10 @@ def _together(
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
 ) -> GaussianMap:
-    """Move every Gaussian half of what the two maps differ there: μ_i' = μ_i + ½ n_i mean_j n_j·(μ_j' - μ_j).
+    """Move every Gaussian by half of the local difference of the maps: μ_i' = μ_i + ½ n_i mean_j n_j·(μ_j' - μ_j).
 
-    The mean is over the Gaussian and its nearest ones of the same map and normal, so that no surface tears; μ_j' is the
-    mean of the other map's layer at Gaussian j, and where that has none the term is 0.
+    The mean is over the Gaussian and its nearest neighbours of the same map and normal, so that no surface tears. μ_j'
+    is the mean of the other map's layer at Gaussian j; without one the term is 0.
     """
     gaussians, known = map.gaussians, replace(config, max_mahalanobis_sq=MAX_APART_SQ * (config.max_layer_sq > 0))
 
@@ -73,15 +73,15 @@ def _fused(
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
 ) -> GaussianMap:
-    """Fuse Gaussians of the other map into those of the first that they cannot be told apart from.
+    """Fuse Gaussians of the second map into those of the first from which they cannot be told apart.
 
-    One may take several, as it does points. Means, colours and normals are averaged by weight; the covariance grows by
-    the spread along the surface only.
+    One Gaussian may take several, as it does points. Means, colours and normals are averaged by weight; the covariance
+    grows by the spread along the surface only.
     """
     old, count = map.gaussians, is_other.shape[0]
     first, other = old.valid & ~is_other, old.valid & is_other
     layer, is_one = nearest_layer(map, other, first, origins, depth_noise, config)
-    to = jnp.where(is_one, layer, jnp.arange(count))  # its own, where it is fused into none
+    to = jnp.where(is_one, layer, jnp.arange(count))  # its own row if it is fused into none
 
     def total(values: Array) -> Array:
         return jnp.zeros_like(values).at[to].add(values)

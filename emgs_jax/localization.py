@@ -1,4 +1,4 @@
-"""Localization (Method C): where the current frame is, first through the previous frame, then against the map."""
+"""Localization (Method C): the pose of the current frame, first through the previous frame, then against the map."""
 
 import math
 from functools import partial
@@ -40,7 +40,7 @@ from emgs_jax.registration.problem import CoarseStart, IcpConfig
 from emgs_jax.registration.repeated_prediction import mean_depth_of, repeat_error, repeat_scale, through_previous
 from emgs_jax.registration.rigid import MIN_PAIRS, pose_row, scale_translation
 
-# Bits of LocalizationInfo.reason; the words are for people.
+# Bits of LocalizationInfo.reason, with words for people.
 REASONS = (
     "the prediction has no valid point or pose",
     "too few points agree with the map",
@@ -54,30 +54,30 @@ ANCHORED, FUSED = map(COARSE.index, ("anchored", "fused"))
 
 
 class LocalizationConfig(eqx.Module):
-    """The coarse step's reading (R7, R8), the fine step (R9) and what a pose must pass.
+    """Readings of the coarse step (R7, R8), settings of the fine step (R9), and the checks of a pose.
 
     Args:
         coarse: `via_previous` (printed): closest points in the previous image carry over to its earlier prediction;
             `same_image`: the two predictions of the previous image directly; `anchored`: the prior's own pose;
-            `fused`: the previous pose and the prior's motion from it, and `anchored`, by their uncertainties. Where
-            the prior says itself how sure it is of its poses, these are they; else they are estimated.
+            `fused`: the previous pose with the prior's motion, and `anchored`, weighted by their uncertainties. The
+            prior may state these; else they are estimated.
         coarse_scale: `none` (printed), `ratio` (median ratio of the depths that were predicted twice) or
             `estimated` (similarity fit).
-        scale_std: of the logarithm of a scale about the mean of those before it, if it erred anew with every frame: the
-            longer errors last, the larger. inf: map and repeats alone hold the scale (printed).
-        max_pair_distance: fraction of the depth; farther points are no pair.
-        pose_shared: part of the variance of the prior's poses that two of its answers about one have in common, see
-            `pose_std`; 1: their differences are ignored, those of depths are used (printed).
-        num_alike: frames that see one part of the map and err alike, see `correct_by_points`.
-        num_shared: frames whose windows share images: so many differences of repeats count, see `repeat_poses`, and the
-            first frame is half as many motions from the middle of its window, see `own_covariance`.
-        min_inlier_fraction: of the points, below which the fine pose is not accepted.
-        max_residual: root mean square distance to the map's planes, as a fraction of the depth; not asked of a pose
-            that is surely known without the points, see `CoarsePose.is_placed`.
+        scale_std: standard deviation of log-scales about their running mean, as if errors of frames were independent;
+            choose it larger the longer errors last. inf: only map and repeated predictions hold the scale (printed).
+        max_pair_distance: fraction of the depth; points farther apart are no pair.
+        pose_shared: part of the variance of the prior's poses that two predictions of one pose share, see `pose_std`;
+            1: their differences are ignored and those of depths used (printed).
+        num_alike: frames that see one part of the map with the same error, see `correct_by_points`.
+        num_shared: frames whose windows share images: this many differences of repeated predictions count, see
+            `repeat_poses`. The first frame is half as many motions from the middle of its window, see `own_covariance`.
+        min_inlier_fraction: smallest fraction of inliers among the points for which the fine pose is accepted.
+        max_residual: root mean square distance to the map's planes, as a fraction of the depth; not checked for a pose
+            that is well known without the points, see `CoarsePose.is_placed`.
         max_step: between the coarse and the fine pose, as a fraction of the mean depth.
         max_step_rad: likewise, rad.
-        max_pose_std: standard deviation of the pose in its least certain direction, by what is known before and by the
-            points: of the translation as a fraction of the depth, of the rotation in rad.
+        max_pose_std: standard deviation of the pose in its least certain direction, by prior and points: of the
+            translation as a fraction of the depth, of the rotation in rad.
     """
 
     coarse: Float[Array, "*b"] = choice(*COARSE)
@@ -99,18 +99,18 @@ class CoarsePose(eqx.Module):
     """Result of the coarse step.
 
     Args:
-        T_world_newest: temporary pose of the newest image (the current one's where there is none).
-        scale: by which this prediction is multiplied about its cameras' origins.
-        repeat_rms: m; disagreement of the two predictions of the previous image, after alignment.
-        mean_depth: m; of the previous image, or of this one where that shows nothing, scaled.
-        depth_noise: as a fraction; the larger of this disagreement and what the previous frame differed from the map.
-        estimate: covariance of this pose and scale; the rest of the frame before.
-        is_known: False where the prediction has no pose: this one is that of the frame before.
-        is_usable: False where the prediction has no valid point or pose.
-        has_field: False where depths are triangulated with the poses, as the prior says by a scale that is certain:
-            then their errors are of pixels, and what looks like a field is the map's.
-        is_placed: True where the prior has the pose from elsewhere than these depths, and knows it better than they
-            tell: how much they differ from the map is then their own error, and no reason to doubt the pose.
+        T_world_newest: temporary pose of the newest image (the current one's without a newer image).
+        scale: of this prediction, about its cameras' origins.
+        repeat_rms: m; difference between the two predictions of the previous image, after alignment.
+        mean_depth: m; of the previous image, or of this one if that has no depth, scaled.
+        depth_noise: as a fraction; the larger of this difference and that of the previous frame from the map.
+        estimate: covariance of this pose and scale; the rest is that of the previous frame.
+        is_known: False if the prediction has no pose; then this is the pose of the previous frame.
+        is_usable: False if the prediction has no valid point or no pose.
+        has_field: False if depths are triangulated with the poses, which the prior states by a certain scale. Their
+            errors are then of pixels, and what looks like a field is an error of the map.
+        is_placed: True if the prior has the pose from elsewhere than these depths, and more accurately than they would
+            give it. A difference from the map is then the depths' error, and no reason to doubt the pose.
     """
 
     T_world_camera: jaxlie.SE3
@@ -132,10 +132,10 @@ class LocalizationInfo(eqx.Module):
     Args:
         reason: bits into `REASONS`; 0 for a tracked frame.
         repeat_rms: see `CoarsePose`.
-        depth_noise: of the points, as a fraction of their depth: how much they differ from the map.
-        noise: likewise of each point, as those of its level of confidence do, in the order of the rows.
+        depth_noise: of the points, as a fraction of their depth: their difference from the map.
+        noise: likewise for each row, measured on the points of its level of confidence.
         step_m: between the coarse and the fine pose.
-        by_map: part of an error of the map that is in the pose, see `correct_by_points`.
+        by_map: share of an error of the map that enters the pose, see `correct_by_points`.
     """
 
     is_tracked: Bool[Array, ""]
@@ -155,10 +155,10 @@ class LocalizationInfo(eqx.Module):
 def _ratio_noise(
     depth_noise: Float[Array, ""], ratio_std: Float[Array, ""], is_firm: Bool[Array, ""], config: LocalizationConfig
 ) -> Float[Array, ""]:
-    """Variance of the logarithm of the ratio of two frames' scales.
+    """Estimate the variance of the logarithm of the ratio of two frames' scales.
 
-    Depths that are repeated exactly hold the scale, for a drift of it and of the pose look alike. A pose that is firm
-    does not give way, and tells them apart.
+    Depths that are repeated exactly hold the scale, because drift of the scale and of the pose look alike. A firm pose
+    tells them apart.
     """
     guess = depth_noise * config.icp.scale_noise
     ratio = jnp.where(config.coarse_scale > 0, jnp.maximum(ratio_std, jnp.where(is_firm, guess, 0.0)), guess)
@@ -166,7 +166,7 @@ def _ratio_noise(
 
 
 def _no_motion(mean_depth: Float[Array, ""], config: LocalizationConfig) -> Float[Array, "7"]:
-    """Standard deviations where no motion is known: as far as a fine step may go, at most a depth, a radian and e."""
+    """Give standard deviations for an unknown motion: the largest fine step, at most a depth, a radian and e."""
     step = jnp.stack([config.max_step, config.max_step_rad, config.scale_std])
     return jnp.minimum(step, 1.0)[jnp.array([0, 0, 0, 1, 1, 1, 2])] * jnp.ones(7).at[:3].set(mean_depth)
 
@@ -179,9 +179,10 @@ def _readings(
     camera: Camera,
     config: LocalizationConfig,
 ) -> tuple[jaxlie.SE3, jaxlie.SE3, jaxlie.SE3, Bool[Array, ""]]:
-    """The prior's motion from the previous frame, its own pose of the current one, and where each reading begins (R7).
+    """Compute the prior's motion from the previous frame, its own pose of the current one, and every reading (R7).
 
-    Last, True if the prior connects the previous frame with this one. If not, its own pose replaces the broken chain.
+    The last value is True if the prior connects the previous frame with this one. If not, its own pose replaces the
+    broken chain.
 
     Args:
         scales: of the prediction's depths, and of its poses.
@@ -192,7 +193,7 @@ def _readings(
     motion = scale_translation(raw_previous.inverse() @ raw_current, unit)
     anchored = anchor @ scale_translation(anchor.inverse() @ raw_current, unit)
     chain = T_world_previous @ motion
-    # Only where it is read: two robust fits over all points.
+    # Only if a reading needs it: two robust fits over all points.
     via_previous, same_image = jax.lax.cond(
         config.coarse < ANCHORED,
         lambda: through_previous(
@@ -216,8 +217,8 @@ def _correct_by_prior(
 ) -> tuple[jaxlie.SE3, Float[Array, ""], PoseEstimate]:
     """Correct pose, scale and their estimate by the prior's own pose (`fused` only) and the prior's own unit.
 
-    A prior that has lost its anchor is wrong altogether, and for long: its pose counts by a Cauchy weight of its
-    distance from the estimate, w = 1 / (1 + χ² / 6).
+    A prior that has lost its anchor is completely wrong, and for long. So its pose has a Cauchy weight by its distance
+    from the estimate, w = 1 / (1 + χ² / 6).
 
     Args:
         T_world_camera: estimate before the measurement.
@@ -246,20 +247,20 @@ def localize_coarse(
     config: LocalizationConfig,
     estimate: PoseEstimate | None = None,
 ) -> CoarsePose:
-    """Coarse registration through the previous frame, which was predicted twice, fused with the prior's own pose.
+    """Register the frame coarsely through the previous one, which was predicted twice, and fuse the prior's own pose.
 
     Args:
-        previous: the previous frame as it was aligned with the map, world frame.
+        previous: the previous frame, aligned with the map, world frame.
         camera: of the (thinned) rows.
         estimate: of the previous frame; None: its pose is exact.
     """
     now, estimate = prediction.previous, exact_estimate() if estimate is None else estimate
     scale, ratio_std = repeat_scale(now, previous, T_world_previous, jnp.exp(estimate.log_scale), config.coarse_scale)
     mean_depth = scale * mean_depth_of(prediction)
-    unknown = MAD_TO_STD * config.max_pair_distance * mean_depth  # where nothing is repeated
+    unknown = MAD_TO_STD * config.max_pair_distance * mean_depth  # without a repeated prediction
     repeat_rms = repeat_error(now, previous, T_world_previous, scale, unknown)
     depth_noise = jnp.maximum(jnp.maximum(repeat_rms / mean_depth, estimate.depth_noise), LEAST_NOISE)
-    # As printed, nothing is known before.
+    # As printed, there is no prior knowledge.
     is_given = is_given_pose(prediction) & (config.icp.prior_information > 0)
     own_unit = jnp.exp(estimate.log_scale)
     unit = jnp.where(is_given, own_unit, scale)
@@ -269,13 +270,13 @@ def localize_coarse(
     repeats, latest = repeat_poses(prediction, estimate.repeats, scale, mean_depth, config.num_shared)
     guess = axis_std(repeats, latest, depth_noise, mean_depth, config.icp.prior_information, config.pose_shared)
     of_motion, of_pose = pose_covariances(prediction.pose_covariance, guess, mean_depth, unit)
-    # Surer than it would be taken to be if nothing was given.
+    # More certain than without a stated uncertainty.
     is_firm = is_given & jnp.all(jnp.diagonal(of_pose) <= guess[1] ** 2)
     of_ratio = _ratio_noise(depth_noise, ratio_std, is_firm, config)
     noise = jnp.zeros((7, 7)).at[:6, :6].set(of_motion).at[6, 6].set(of_ratio)
     noise = jnp.where(is_linked, noise, jnp.diag(_no_motion(mean_depth, config) ** 2))
     estimate = propagate(estimate, motion, noise)
-    # A pose that is given with its uncertainty needs no other evidence of it.
+    # A pose with a stated uncertainty needs no other estimate of it.
     repeats = jax.tree.map(partial(jnp.where, is_given), no_repeats(), repeats)
     estimate = eqx.tree_at(lambda b: (b.repeats, b.is_given), estimate, (repeats, is_given))
     known = pose_row(forms, config.coarse.astype(jnp.int32)), scale
@@ -307,7 +308,7 @@ def localize_coarse(
 
 
 def _corrected(current: Observation, field: DepthField) -> Observation:
-    """The points of a frame without its field of depth errors: x exp(-f)."""
+    """Remove the field of depth errors from the points of a frame: x exp(-f)."""
     factor = jnp.exp(-field_at(field, current.points))
     return eqx.tree_at(lambda o: o.points, current, current.points * factor[:, None])
 
@@ -320,12 +321,12 @@ def localize_fine(
     config: LocalizationConfig,
     index: GaussianIndex | None = None,
 ) -> tuple[jaxlie.SE3, Observation, LocalizationInfo]:
-    """Fine registration against the submap; the coarse pose and scale stay where a check fails.
+    """Register the frame to the submap; if a check fails, the coarse pose and scale stay.
 
     Args:
         current: camera frame, unscaled.
         submap: Gaussians, world frame.
-        index: of the submap; None makes it here.
+        index: of the submap; None builds it here.
 
     Returns:
         T_world_camera, the observation in the world frame, and the outcome.
@@ -335,7 +336,7 @@ def localize_fine(
     start = CoarseStart(coarse.T_world_camera, known, coarse.depth_noise, coarse.estimate.is_given)
     fine, scale, info = icp(scaled, submap, start, config.icp, index)
     step = (coarse.T_world_camera.inverse() @ fine).log()
-    # The length has no gradient where a step is zero, which it is to the bit with an exact prior; this has.
+    # A length has no gradient at zero, which the step is to the bit with an exact prior; this has one.
     step_m, step_rad = (part @ safe_normalize(part) for part in (step[:3], step[3:]))
     failed = jnp.stack(
         [

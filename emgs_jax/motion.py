@@ -1,4 +1,4 @@
-"""Moving things: points that stand where other frames look through. Free space decides, not a class."""
+"""Moving things: points in places where other frames see free space. Free space decides, not a class."""
 
 import math
 from collections.abc import Callable
@@ -18,16 +18,16 @@ from emgs_jax.registration.pose_estimate import PoseEstimate
 
 
 class MotionConfig(eqx.Module):
-    """What tells a moving thing from the static scene and from a wrong prediction.
+    """How to tell a moving thing from the static scene and from a wrong prediction.
 
     Args:
-        num_looks: tracked frames before a frame, and after it, that are compared with it; 0: nothing is taken for
-            moving, as printed. What stands still for about half as many becomes map.
+        num_looks: tracked frames before and after a frame that are compared with it; 0: nothing moves, as printed. What
+            stands still for about half as many frames is mapped.
         hit: log-likelihood ratio, static to moving, of a look that shows a surface exactly where the point is.
-        miss: the most that a look which shows free space there takes away: it may be a wrong prediction.
+        miss: the most that a look subtracts if it shows free space there; that look may be a wrong prediction.
         prior: log-odds of static before any look.
-        radius: neighbours, in pixels of the thinned image, over whose square the log-odds are averaged: a prediction is
-            wrong along edges, a thing that moves is an area.
+        radius: half side, in pixels of the thinned image, of the square over which the log-odds are averaged: wrong
+            predictions lie along edges, whereas a moving thing is an area.
     """
 
     num_looks: int = static(low=0, high=64)
@@ -38,18 +38,18 @@ class MotionConfig(eqx.Module):
 
 
 class Looks(eqx.Module):
-    """The last tracked frames, newest first, and what later frames say of their points.
+    """The last tracked frames, newest first, and what later frames have shown about their points.
 
     Args:
-        points: of each in its own camera frame (m), as it was aligned; 0 where it has none.
-        depth: nearest and farthest z (m) among a pixel and its eight neighbours; 0 where it has none.
+        points: of each frame, aligned, in its own camera frame (m); 0 where there is none.
+        depth: nearest and farthest z (m) among a pixel and its eight neighbours; 0 where there is none.
         said: pixels that were taken for moving when the frame was mapped.
-        moving: those, and what later frames show to have moved: they are no evidence that something stands there.
-        log_odds: of static to moving, of later frames: a sum of log-likelihood ratios.
-        free: most free space that a later frame has shown behind a point so far, in standard deviations.
-        step: the largest step of that from one frame to the next.
-        time: of each frame, as `SlamState.time`; -1 where there is none.
-        T_previous_look: of each camera, in that of the last frame: however the map moves, they stay as they are.
+        moving: these, and pixels that later frames show to have moved; they are no evidence of a surface.
+        log_odds: of static to moving, by later frames: a sum of log-likelihood ratios.
+        free: the most free space that a later frame has shown behind a point, in standard deviations.
+        step: the largest increase of `free` from one frame to the next.
+        time: of each frame, as `SlamState.time`; -1 without a frame.
+        T_previous_look: pose of each camera in that of the last frame, so that it stays valid when the map moves.
     """
 
     points: Float[Array, "*k p 3"]
@@ -64,10 +64,10 @@ class Looks(eqx.Module):
 
 
 def no_looks(view: Observation, config: MotionConfig) -> Looks | None:
-    """Before the first frame; None where nothing is taken for moving.
+    """Make the looks before the first frame; None if motion is off.
 
     Args:
-        view: any, for its number of rows.
+        view: any observation, for its number of rows.
     """
     if config.num_looks == 0:
         return None
@@ -79,13 +79,13 @@ def no_looks(view: Observation, config: MotionConfig) -> Looks | None:
 def _first_look(
     points: Float[Array, "p 3"], depth: Float[Array, "2 p"], moving: Bool[Array, "p"], time: Int[Array, ""]
 ) -> Looks:
-    """One look, of the last frame itself: no later one has said anything of it."""
+    """Make a look of the last frame, before any later frame."""
     zeros = jnp.zeros(moving.shape)
     return Looks(points, depth, moving, moving, zeros, zeros, zeros, time, jaxlie.SE3.identity())
 
 
 def looks_from(looks: Looks, T_camera_previous: jaxlie.SE3) -> Looks:
-    """The looks where they are in the world, relative to a camera that takes the place of the last one."""
+    """Keep the looks in place in the world, but relative to another camera than the last one."""
     poses = jax.vmap(lambda T: (T_camera_previous @ jaxlie.SE3(T)).wxyz_xyz)(looks.T_previous_look.wxyz_xyz)
     return replace(looks, T_previous_look=jaxlie.SE3(poses))
 
@@ -101,15 +101,15 @@ def look_back(
     camera: Camera,
     config: MotionConfig,
 ) -> Looks:
-    """The looks with what one more frame says of them, see `_evidence` and `_moves`.
+    """Update the looks by the evidence of one more frame, see `_evidence` and `_moves`.
 
-    `find_movers` asks the looks before a frame, this the frames after a look. They are asked apart: what stands for a
-    while and then leaves has moved, however many looks before have seen it stand.
+    `find_movers` uses the looks before a frame, this function the frames after a look. They are separate: what stands
+    for a while and then leaves has moved, however many earlier looks saw it stand.
 
     Args:
-        view: the frame as it was aligned, world frame.
+        view: the aligned frame, world frame.
         moving: its rows that move.
-        estimate: of its pose, with the noise of its depths; where that is 0 it is not known, and nothing is said.
+        estimate: of its pose, with the noise of its depths; noise of 0 is unknown, and gives no evidence.
     """
     looks = looks_from(looks, T_world_camera.inverse() @ T_world_previous)
     depth, evidence = jnp.nan_to_num(depth_range(view, T_world_camera, camera)), _evidence(estimate, camera, config)
@@ -133,10 +133,10 @@ def look_again(
     time: Int[Array, ""],
     camera: Camera,
 ) -> Looks:
-    """The looks, relative to this camera, with a frame as the newest one if it has a valid point.
+    """Add a frame with a valid point as the newest look, and make all looks relative to this camera.
 
     Args:
-        view: the frame as it was aligned, world frame.
+        view: the aligned frame, world frame.
         moving: its rows that move.
     """
     points = jnp.where(view.valid[:, None], T_world_camera.inverse() @ view.points, 0.0)
@@ -154,14 +154,14 @@ def find_movers(
     camera: Camera,
     config: MotionConfig,
 ) -> Bool[Array, "p"]:
-    """Which valid points of a frame move, by the looks before it, see `_evidence` and `_moves`.
+    """Find the valid points of a frame that move, by the looks before it, see `_evidence` and `_moves`.
 
-    What no look saw is static.
+    A point that no look saw is static.
 
     Args:
         view: camera frame, in the map's unit.
         T_previous_camera: from this camera to that of the last frame.
-        estimate: of this pose, with the noise ν of depths; where that is 0 it is not known, and nothing moves.
+        estimate: of this pose, with the noise ν of depths; noise of 0 is unknown, and nothing moves.
     """
     evidence = _evidence(estimate, camera, config)
 
@@ -175,19 +175,19 @@ def find_movers(
 
 
 def _evidence(estimate: PoseEstimate, camera: Camera, config: MotionConfig) -> Callable:
-    """What a look says of points in its camera frame: a log-likelihood ratio, static to moving, and free space.
+    """Make the evidence of a look on points in its camera frame: log-likelihood ratio, static to moving; free space.
 
-    A point of depth z is compared with the depths d round its pixel in the look: with g the distance to them in
-    standard deviations, the ratio is hit - g²/2. Before them, in free space, it is -miss at the least, since either
-    prediction may be wrong; behind them the point is not seen, and it is 0 at the least. The variance of z - d is that
-    of both depths, 2 (ν z)², and what the pose may err at that distance.
+    A point of depth z is compared with the depths d around its pixel in the look. With g the distance to them in
+    standard deviations, the ratio is hit - g²/2. In front of them, in free space, it is at least -miss, because either
+    prediction may be wrong. Behind them the point is occluded, and the ratio is at least 0. The variance of z - d is
+    that of both depths, 2 (ν z)², plus that of the pose at that distance.
 
     Args:
         estimate: of the newer one of both poses.
 
     Returns:
-        Of points (p, 3), the look's range of depths (2, p) and its pixels that move: the ratios, and the free space
-        behind each point in standard deviations; 0 where the look shows nothing.
+        A function of points (p, 3), the look's range of depths (2, p) and its moving pixels. It gives the ratios and
+        the free space behind each point in standard deviations; 0 where the look shows nothing.
     """
     pose_variance = jnp.diagonal(estimate.covariance)
     shift, turn = jnp.mean(pose_variance[:3]), jnp.mean(pose_variance[3:6])
@@ -216,12 +216,12 @@ def _moves(
     camera: Camera,
     config: MotionConfig,
 ) -> Bool[Array, "p"]:
-    """Which pixels of a frame move, by the sum of what looks say of them, averaged over neighbours.
+    """Decide which pixels of a frame move, by the looks' summed evidence, averaged over neighbours.
 
-    Depths of a network drift: what stands comes nearer by some percent a frame, until all older looks see through it.
-    What moves leaves free space from one look to the next. With j the largest step, in standard deviations, of the free
-    space behind a point from one look to the one that is farther in time, the log-odds of static are
-    prior + hit - j²/2 at least.
+    Depths of a network drift: a static surface comes nearer by some percent a frame, until all older looks see through
+    it. A moving thing opens free space from one look to the next. Let j be the largest increase, in standard
+    deviations, of the free space behind a point from one look to the next one farther in time. The log-odds of static
+    are at least prior + hit - j²/2.
     """
     drifting = config.hit - 0.5 * step**2
     found = jnp.where(is_told, config.prior + jnp.maximum(log_odds, drifting), 0.0)

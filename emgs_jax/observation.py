@@ -14,13 +14,13 @@ from emgs_jax.ops.neighbours import is_within_reach
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, traced, where_rows
 
-ROUNDED_SQUARE = 2.0**-19  # of a unit quaternion's squared length, what it may be off by rounding
+ROUNDED_SQUARE = 2.0**-19  # by which rounding may change a unit quaternion's squared length
 
 
 class Observation(eqx.Module):
     """Points of one image, row by row in the order of its (thinned) pixels.
 
-    Two predictions of the same image correspond row by row. Invalid rows hold finite values of no meaning.
+    Two predictions of the same image correspond row by row. Invalid rows hold arbitrary finite values.
     """
 
     points: Float[Array, "*b p 3"]  # m; camera or world frame, as the holder says
@@ -39,12 +39,12 @@ class Prediction(eqx.Module):
         previous: the frame before it, in its own camera frame; row by row the same pixels as last time.
         T_world_views: the prior's own poses, composed with the anchor; rows: previous, current, newest.
         T_world_anchor: pose of the anchor, about which the scale of this call acts.
-        pose_covariance: of ξ where the true pose is T Exp(ξ), translation (unit of the prediction), rotation (rad);
-            rows: motion from the previous frame, own pose. NaN where the prior does not say how sure it is.
+        pose_covariance: of ξ, if the true pose is T Exp(ξ): translation (unit of the prediction), rotation (rad). Rows:
+            motion from the previous frame, own pose. NaN if the prior states no uncertainty.
         scale_std: of the logarithm of the factor between the lengths of the current frame's points and of its pose. NaN
-            where the prior does not say how sure it is.
+            if the prior states no uncertainty.
         has_newest: False at the end of a sequence, where there is no newer image.
-        is_repeat: False where the frame before is of the same call, so that nothing of it is said twice.
+        is_repeat: False if the previous frame comes from the same call, so that nothing was predicted twice.
     """
 
     current: Observation
@@ -58,12 +58,12 @@ class Prediction(eqx.Module):
 
 
 def no_covariance() -> Float[Array, "2 6 6"]:
-    """`Prediction.pose_covariance` where the prior does not say how sure it is."""
+    """Make `Prediction.pose_covariance` of a prior that states no uncertainty."""
     return jnp.full((2, 6, 6), jnp.nan, jnp.float32)  # not of a weak type, which is another program
 
 
 def unknown_scale() -> Float[Array, ""]:
-    """`Prediction.scale_std` where the prior does not say how sure it is."""
+    """Make `Prediction.scale_std` of a prior that states no uncertainty."""
     return jnp.asarray(jnp.nan, jnp.float32)
 
 
@@ -71,9 +71,9 @@ class ObservationConfig(eqx.Module):
     """Conversion of a point map into an observation: thinning, normals and masking.
 
     Args:
-        thin: every `thin`-th row and column is kept; 1 = the paper, every pixel.
+        thin: every `thin`-th row and column is kept; 1 = every pixel, as in the paper.
         normal_radius: normals are fitted over (2·normal_radius + 1)² pixels.
-        normal_spacing: of which every `normal_spacing`-th row and column is used.
+        normal_spacing: step between the rows and columns of that window that are used.
         max_depth_step: neighbours whose depth differs by more than this fraction lie on another surface.
         min_confidence: points below are left out.
     """
@@ -88,13 +88,13 @@ class ObservationConfig(eqx.Module):
 def normals_from_pointmap(
     points: Float[Array, "h w 3"], valid: Bool[Array, "h w"], config: ObservationConfig
 ) -> Float[Array, "h w 3"]:
-    """Unit normals, towards the camera, of the planes that fit the surroundings of every pixel.
+    """Fit a plane to the surroundings of every pixel and return its unit normal, towards the camera.
 
     On a plane n·X = c the inverse depth is linear along the rays d = X / z: 1/z = (n / c)·d. The least-squares fit of
-    n / c over the window needs no eigenvectors, and neighbours across a depth step are left out.
+    n / c over the window needs no eigenvectors. Neighbours across a depth step are left out.
 
     Returns:
-        Camera frame; zero where the pixel is invalid or a fifth of the window or less lies on its surface.
+        Normals, camera frame; zero if the pixel is invalid or at most a fifth of the window lies on its surface.
     """
     points = jnp.where(valid[..., None], points, 0.0)
     depth = points[..., 2]
@@ -107,21 +107,21 @@ def normals_from_pointmap(
     around = jnp.pad(inverse_depth, border), jnp.pad(ray_xy, [*border, (0, 0)])
 
     def add(moments: tuple[Array, ...], tap: Int[Array, "2"]) -> tuple[tuple[Array, ...], None]:
-        """One neighbour of every pixel: its count, offsets x, y, u = 1/z relative to the pixel, and their products."""
+        """Add one neighbour of every pixel: its count, offsets x, y, u = 1/z from the pixel, and their products."""
         other, ray = (jax.lax.dynamic_slice(x, (*tap, 0)[: x.ndim], (*depth.shape, 2)[: x.ndim]) for x in around)
         is_same = (other > 0) & (jnp.abs(other - inverse_depth) <= config.max_depth_step * inverse_depth)
         (x, y), u = jnp.unstack(ray - ray_xy, axis=-1), other - inverse_depth
         terms = jnp.ones_like(u), x, y, u, x * x, x * y, y * y, x * u, y * u
         return tuple(sum + jnp.where(is_same, term, 0.0) for sum, term in zip(moments, terms, strict=True)), None
 
-    # A loop: unrolled, these few lines were a tenth of all that is compiled.
+    # A loop: unrolled, these few lines took a tenth of all compilation.
     sums, _ = jax.lax.scan(add, (jnp.zeros_like(depth),) * 9, taps)
     count, xx, xy, yy, xu, yu = sums[0], *sums[4:]
     x, y, u = (total / jnp.maximum(count, 1.0) for total in sums[1:4])
     xx, xy, yy = xx - count * x**2, xy - count * x * y, yy - count * y**2
     xu, yu = xu - count * x * u, yu - count * y * u
     det = xx * yy - xy * xy
-    # Valid pixels in one line determine no plane; rounding must not decide.
+    # Valid pixels in one line determine no plane; do not let rounding decide.
     is_fitted = valid & (count > taps.shape[0] / 5) & (det > 1e-4 * (xx + yy) ** 2)
     safe_det = jnp.where(is_fitted, det, 1.0)
     slope = jnp.stack([yy * xu - xy * yu, xx * yu - xy * xu], axis=-1) / safe_det[..., None]
@@ -131,10 +131,10 @@ def normals_from_pointmap(
 
 
 def sample_features(grid: Float[Array, "y x f"], size: tuple[int, int], thin: int) -> Float[Array, "h w f"]:
-    """Features of every `thin`-th row and column of an image, from a grid of cells that together cover the image.
+    """Sample the features of every `thin`-th row and column of an image from a grid of cells that covers it.
 
     Pixel u of W lies at ((u + ½) x / W) - ½ among x columns, and rows likewise: bilinear between the cells' centres,
-    the border cell's beyond them, unit length again. One cell per pixel is taken as it is.
+    constant beyond them, then normalised. A grid with one cell per pixel is used as it is.
 
     Args:
         grid: unit features, zero where there is none.
@@ -153,7 +153,7 @@ def sample_features(grid: Float[Array, "y x f"], size: tuple[int, int], thin: in
 
 
 def sound(observation: Observation) -> Observation:
-    """The observation with every row invalid, and 0, in which a number is not finite or a point beyond any map.
+    """Invalidate rows with a number that is not finite or a point beyond any map, and set them to 0.
 
     Colours are clipped to [0, 1].
     """
@@ -167,10 +167,10 @@ def sound(observation: Observation) -> Observation:
 
 
 def sound_poses(poses: jaxlie.SE3) -> jaxlie.SE3:
-    """The poses, NaN where one is beyond any map or its quaternion is no rotation's.
+    """Set poses to NaN that lie beyond any map or whose quaternion is not a rotation's.
 
-    A quaternion that is longer or shorter than by rounding becomes one of unit length: products of poses take that for
-    granted, and over many frames the lengths multiply.
+    A quaternion that is off unit length by more than rounding is normalised: products of poses rely on unit length, and
+    over many frames the lengths multiply.
     """
     quaternion, translation = poses.wxyz_xyz[..., :4], poses.wxyz_xyz[..., 4:]
     length_sq = jnp.sum(quaternion**2, axis=-1)
@@ -182,7 +182,7 @@ def sound_poses(poses: jaxlie.SE3) -> jaxlie.SE3:
 
 
 def sound_covariances(covariances: Float[Array, "*b 6 6"]) -> Float[Array, "*b 6 6"]:
-    """The covariances, NaN where a variance is negative or a correlation impossible."""
+    """Set covariances to NaN that have a negative variance or an impossible correlation."""
     variances = jnp.diagonal(covariances, axis1=-2, axis2=-1)
     std = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
     correlations = covariances / std[..., None] / std[..., None, :]
@@ -194,13 +194,13 @@ def sound_covariances(covariances: Float[Array, "*b 6 6"]) -> Float[Array, "*b 6
 def known_surface(
     points: Float[Array, "h w 3"], mask: Bool[Array, "h w"], config: ObservationConfig
 ) -> Bool[Array, "h w"]:
-    """Return the mask of the points that `observe` takes: inside `mask`, before the camera and with a normal."""
+    """Return the mask of the points that `observe` keeps: inside `mask`, in front of the camera and with a normal."""
     valid = mask & is_within_reach(points) & (points[..., 2] > 0)
     return valid & _is_surface(normals_from_pointmap(jnp.where(valid[..., None], points, 0.0), valid, config))
 
 
 def _is_surface(normals: Float[Array, "h w 3"]) -> Bool[Array, "h w"]:
-    """A point without a normal lies on a sliver or in a hole's rim, where a prior guesses."""
+    """Tell which points have a normal; the others lie on slivers or rims of holes, where a prior guesses."""
     return jnp.any(normals != 0, axis=-1)
 
 
@@ -213,10 +213,10 @@ def observe(
     mask: Bool[Array, "h w"],
     config: ObservationConfig,
 ) -> Observation:
-    """Normals from the full point map, then every `thin`-th row and column as rows of an `Observation`.
+    """Compute normals from the full point map, then take every `thin`-th row and column as rows of an `Observation`.
 
-    Left out is what is not finite, behind the camera or beyond any map. `features` is a grid of any resolution that
-    covers the image, see `sample_features`; one that is not finite is missing.
+    Points that are not finite, behind the camera or beyond any map are left out. `features` is a grid of any resolution
+    that covers the image, see `sample_features`; a feature that is not finite counts as missing.
     """
     is_sound = is_within_reach(points) & (points[..., 2] > 0) & jnp.all(jnp.isfinite(colors), axis=-1)
     valid = mask & is_sound & jnp.isfinite(confidence) & (confidence >= config.min_confidence)
@@ -238,14 +238,14 @@ def observe(
 
 @full_precision
 def depth_in(T_world_camera: jaxlie.SE3, observation: Observation) -> Float[Array, "p"]:
-    """Camera-space z (m) of world-frame points."""
+    """Compute the camera-space z (m) of world-frame points."""
     return ((observation.points - T_world_camera.translation()) @ T_world_camera.rotation().as_matrix())[:, 2]
 
 
 def depth_range(view: Observation, T_world_camera: jaxlie.SE3, camera: Camera) -> Float[Array, "2 p"]:
-    """Nearest and farthest depth z (m) among each pixel and its eight neighbours; NaN where the pixel itself has none.
+    """Find the nearest and farthest depth z (m) among each pixel and its eight neighbours; NaN if the pixel has none.
 
-    A pose that is wrong by a pixel must not show what is behind a thin pole.
+    This way, a pose that is off by a pixel does not see through a thin pole.
     """
     depth = depth_in(T_world_camera, view).reshape(camera.height, camera.width)
     valid = view.valid.reshape(depth.shape)

@@ -1,4 +1,4 @@
-"""Rasterisation-based refinement (Method D, eq. 5 and 6): what EM left over is merged on the image plane or is new."""
+"""Rasterisation-based refinement (Method D, eq. 5 and 6): merge what EM left over on the image, or add it."""
 
 import math
 
@@ -28,10 +28,10 @@ class RefinementConfig(eqx.Module):
         front_margin: fraction of the depth by which a candidate may lie in front of the map and still be merged; 0 as
             printed (R6).
         back_margin: likewise behind it; `inf` as printed.
-        depth_condition: where a candidate has to lie within the margins: of the rendered depth at its own `pixel`
-            (printed); or there and of each Gaussian's plane, so that `pairs` never join two sides of a depth edge.
-        min_normal_cos: a pair whose normals differ more does not merge; `-inf` as printed.
-        cosine_weight: how much of ω is the features' cosine: 1 as printed; 0: features decide nothing here.
+        depth_condition: what a candidate's margins refer to: the rendered depth at its own `pixel` (printed), or also
+            each Gaussian's plane (`pairs`), so that no pair joins two sides of a depth edge.
+        min_normal_cos: pairs whose normals differ more do not merge; `-inf` as printed.
+        cosine_weight: share of the features' cosine in ω: 1 as printed; 0: features do not count.
         max_splat_std: pixels of the rendered image; a wider candidate is scattered points, not a surface, and is
             dropped; `inf` as printed.
     """
@@ -59,7 +59,7 @@ class RefinementInfo(eqx.Module):
 
 
 def depth_at(rendering: Rendering, splats: Splats, camera: Camera) -> Float[Array, "g"]:
-    """Rendered depth at the pixel of every splat's mean; 0 where the map has none or the mean is outside the image."""
+    """Look up the rendered depth at every splat's mean; 0 if there is none or the mean is outside the image."""
     index, inside = nearest_pixel(splats.means, (camera.height, camera.width))
     return jnp.where(splats.valid & inside, rendering.depth.reshape(-1)[index], 0.0)
 
@@ -67,10 +67,10 @@ def depth_at(rendering: Rendering, splats: Splats, camera: Camera) -> Float[Arra
 def match_on_image(
     map_splats: Splats, candidate_splats: Splats, visible: Bool[Array, "n"], config: RefinementConfig
 ) -> tuple[Int[Array, "g k"], Float[Array, "g k"], Bool[Array, "g k"]]:
-    """The K_2D nearest visible map splats of every candidate, and the squared distance under Σ_map + Σ_candidate."""
+    """Find every candidate's K_2D nearest visible map splats, and squared distances under Σ_map + Σ_candidate."""
     groups = group_points(map_splats.means, visible)
     asked = candidate_splats.means, candidate_splats.valid
-    # Candidates may be few and far from each other: few of them share a list, and that is long.
+    # Candidates may be few and far apart, so few of them share a list and the list is long.
     k = config.num_candidates
     rows, found = nearest(*asked, map_splats.means, groups, k, size=4, count=16 * k)
     covs = map_splats.covs[rows] + candidate_splats.covs[:, None]
@@ -81,7 +81,7 @@ def match_on_image(
 def within_margins(
     depth: Float[Array, "*g"], surface: Float[Array, "*g"], config: RefinementConfig
 ) -> Bool[Array, "*g"]:
-    """Test whether a depth is within the margins in front of and behind a surface, fractions of its depth."""
+    """Test whether a depth is within the margins in front of and behind a surface (fractions of its depth)."""
     relative = depth / surface - 1.0
     return (relative >= -config.front_margin) & (relative <= config.back_margin)
 
@@ -94,7 +94,7 @@ def show_one_surface(
     rows: Int[Array, "g k"],
     config: RefinementConfig,
 ) -> Bool[Array, "g k"]:
-    """Pairs whose normals agree, the candidate within the margins of the Gaussian's plane at the candidate's pixel."""
+    """Find pairs whose normals agree, the candidate within the margins of the Gaussian's plane at its pixel."""
 
     def plane_depth(rows: Int[Array, "k"], pixel: Float[Array, "2"]) -> Float[Array, "k"]:
         return splat_depth(take_rows(map_splats, rows), pixel[None], config.render)[:, 0]
@@ -113,7 +113,7 @@ def merge_weights(
     on_surface: Bool[Array, "g"],
     config: RefinementConfig,
 ) -> Float[Array, "g k"]:
-    """ω of eq. 5: softmax of -½ d² over the K_2D matches times the features' cosine; 0 where a pair does not merge."""
+    """Compute ω of eq. 5: softmax of -½ d² over the K_2D matches times the features' cosine; 0 for no merge."""
     rows, distance_sq, found = match
     some = found | ~jnp.any(found, axis=-1, keepdims=True)  # a softmax over nothing would be NaN
     omega = jax.nn.softmax(-0.5 * distance_sq, axis=-1, where=some)
@@ -121,7 +121,7 @@ def merge_weights(
     cosine = jnp.einsum("gkf,gf->gk", mapped[rows], fresh)
     both = has_feature(candidates.features)[:, None] & has_feature(old.features)[rows]
     share = config.cosine_weight * jnp.maximum(cosine, 0.0) + (1.0 - config.cosine_weight)
-    omega = omega * jnp.where(both, share, 1.0)  # opposite meanings do not merge
+    omega = omega * jnp.where(both, share, 1.0)  # opposite features do not merge
     is_match = found & (candidates.valid & on_surface)[:, None] & (distance_sq < config.max_mahalanobis_sq_2d)
     return jnp.where(is_match, omega, 0.0)
 
@@ -129,7 +129,7 @@ def merge_weights(
 def average_candidates(
     candidates: Gaussians, rows: Int[Array, "g k"], weights: Float[Array, "g k"], old: Gaussians
 ) -> Gaussians:
-    """ω-weighted average of the candidates that merge into each map Gaussian; the old values where none does.
+    """Average the candidates that merge into each map Gaussian, weighted by ω; without any, the old values.
 
     The covariance is that of the mixture: mean covariance plus the spread of the candidates' means.
     """
@@ -165,14 +165,14 @@ def refine(
     camera: Camera,
     config: RefinementConfig,
 ) -> tuple[GaussianMap, Gaussians, RefinementInfo]:
-    """Merge candidates with the map where both show the same surface; the rest is fresh.
+    """Merge candidates with the map where both show the same surface; the others are fresh.
 
     A candidate on a pixel without map depth is fresh. Otherwise it merges with those of its K_2D closest map Gaussians
-    that show the same surface and pass the distance gate, unless it lies in front of the map (or behind it) by more
-    than the margin.
+    that show the same surface and pass the distance gate, unless it lies in front of or behind the map by more than the
+    margin.
 
     Args:
-        submap: what is seen, world frame.
+        submap: the local map, world frame.
         candidates: Gaussians of the points that EM did not fuse.
         T_world_camera: refined pose.
         camera: of the images that are rendered.
@@ -188,7 +188,7 @@ def refine(
     is_surface = candidates.valid & (widest <= config.max_splat_std)
     candidates = eqx.tree_at(lambda g: g.valid, candidates, is_surface)
     map_depth = depth_at(rendering, candidate_splats, camera)
-    # Only what the image shows can be matched: a Gaussian behind the rendered surface is occluded.
+    # Match only visible Gaussians: one behind the rendered surface is occluded.
     own_depth = depth_at(rendering, map_splats, camera)
     reach = config.render.radius * map_splats.depth_std
     visible = map_splats.valid & (own_depth > 0) & (map_splats.depth <= own_depth + reach)

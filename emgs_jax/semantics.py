@@ -8,7 +8,7 @@ from emgs_jax.gaussians import Gaussians, has_feature
 from emgs_jax.ops.linalg import safe_normalize
 from emgs_jax.ops.precision import full_precision
 
-MIN_SPREAD = 1e-3  # of a direction of unit features; along a smaller one they do not differ, but for rounding
+MIN_SPREAD = 1e-3  # of unit features along a direction; a smaller spread is rounding
 
 
 class Relevance(eqx.Module):
@@ -16,9 +16,9 @@ class Relevance(eqx.Module):
 
     Args:
         cosines: of every Gaussian's feature with each word; 0 without a feature.
-        leads: cosine minus the largest one with any other word or rival; plus 1 where there is no other. Positive for
-            the closest word only.
-        labels: the word that a Gaussian answers, -1 for none of them.
+        leads: cosine minus the largest one with any other word or rival; cosine plus 1 without another. Positive only
+            for the closest word.
+        labels: the word that a Gaussian answers to, -1 for none.
     """
 
     cosines: Float[Array, "n c"]
@@ -28,7 +28,7 @@ class Relevance(eqx.Module):
 
 @full_precision
 def similarities(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> Float[Array, "n c"]:
-    """Cosine of every Gaussian's feature and every class's text embedding; 0 for a Gaussian without a feature."""
+    """Compute the cosine of every Gaussian's feature with every class's text embedding; 0 without a feature."""
     products = gaussians.features @ safe_normalize(text_features).T
     squared = gaussians.features**2 @ jnp.ones((text_features.shape[-1], 1))  # a sum would take longer than the product
     return jnp.where(squared > 0, products / jnp.sqrt(jnp.where(squared > 0, squared, 1.0)), 0.0)
@@ -36,7 +36,7 @@ def similarities(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> Fl
 
 @full_precision
 def classify(gaussians: Gaussians, text_features: Float[Array, "c f"]) -> Int[Array, "n"]:
-    """Class of every Gaussian; -1 for invalid rows and for Gaussians without a feature.
+    """Classify every Gaussian; -1 for invalid rows and for Gaussians without a feature.
 
     Raises:
         ValueError: the embeddings' width differs from the map's, or there is no class.
@@ -53,14 +53,14 @@ def relevance(
     margin: Float[Array, ""],
     min_cosine: Float[Array, ""],
 ) -> Relevance:
-    """Ask for words. A Gaussian is an answer to the closest one, unless a rival or another word is nearly as close.
+    """Search for words: a Gaussian answers to the closest one, unless a rival or another word is nearly as close.
 
     Args:
         gaussians: invalid rows and those without a feature answer to nothing.
-        words: text embeddings; of any length but 0.
-        rivals: embeddings of what is not asked for; perhaps none.
-        margin: the lead that an answer needs.
-        min_cosine: the cosine that an answer needs.
+        words: text embeddings, of any norm but 0.
+        rivals: embeddings of words that are not searched for; may be empty.
+        margin: smallest lead of an answer.
+        min_cosine: smallest cosine of an answer.
 
     Raises:
         ValueError: the embeddings' width differs from the map's, or there is no word.
@@ -77,11 +77,11 @@ def answers(
     margin: Float[Array, ""],
     min_cosine: Float[Array, ""],
 ) -> Relevance:
-    """`relevance` by the cosines alone; a rival that is as close as the closest word wins.
+    """Decide `relevance` from cosines; a rival that is as close as the closest word wins.
 
     Args:
-        words: cosine of every Gaussian with each word that is asked for, at least one.
-        is_known: False for Gaussians that cannot be an answer.
+        words: cosine of every Gaussian with each word that is searched for, at least one.
+        is_known: False for Gaussians that cannot answer.
     """
     count, known = rivals.shape[-1], jnp.concatenate([rivals, words], axis=-1)
     best = jnp.argmax(known, axis=-1)  # the first of equals
@@ -98,10 +98,10 @@ def answers(
 
 @full_precision
 def principal_colors(gaussians: Gaussians) -> Float[Array, "n 3"]:
-    """Colour features by their coordinates along the three directions in which they differ most, as RGB in [0, 1].
+    """Colour features by their coordinates along their three principal directions, as RGB in [0, 1].
 
-    Each direction's sign makes its largest entry positive; 98 % of the Gaussians span 0 to 1. Grey (.5) is a direction
-    in which features do not differ, an invalid row, and a Gaussian without a feature.
+    Each direction's sign makes its largest entry positive; 98 % of the Gaussians span 0 to 1. Grey (.5) marks a
+    direction without variation, an invalid row, and a Gaussian without a feature.
     """
     is_known = _is_known(gaussians)
     count = jnp.maximum(jnp.sum(is_known), 1)
@@ -112,7 +112,7 @@ def principal_colors(gaussians: Gaussians) -> Float[Array, "n 3"]:
     largest = jnp.take_along_axis(directions, jnp.argmax(jnp.abs(directions), axis=0)[None], axis=0)
     along = centered @ jnp.where(largest < 0, -directions, directions)
     low, high = jnp.nanpercentile(jnp.where(is_known[:, None], along, jnp.nan), jnp.array([1.0, 99.0]), axis=0)
-    is_spread = high - low > MIN_SPREAD  # False where nothing is known, which makes both ends NaN
+    is_spread = high - low > MIN_SPREAD  # False without any feature, when both ends are NaN
     shares = (along - jnp.where(is_spread, low, 0.0)) / jnp.where(is_spread, high - low, 1.0)
     return jnp.where(is_spread & is_known[:, None], jnp.clip(shares, 0.0, 1.0), 0.5)
 

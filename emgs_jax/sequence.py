@@ -1,4 +1,4 @@
-"""From words to a mapped sequence: `map_sequence(load_config("dataset=images", …))`."""
+"""From the words of a command line to a mapped sequence: `map_sequence(load_config("dataset=images", …))`."""
 
 from dataclasses import dataclass, replace
 from typing import Any
@@ -23,11 +23,11 @@ from emgs_jax.slam import SlamConfig, Stage
 
 @dataclass(frozen=True)
 class RunConfig:
-    """One sequence and how it is mapped.
+    """A sequence and how to map it.
 
     Args:
-        settings: everything, as plain values; what the next ones are made of.
-        densify: what of a rendered view becomes a point.
+        settings: all keys as plain values; the other fields are built from them.
+        densify: which pixels of a rendered view become points.
         evaluation: the protocol of the comparison with the truth.
     """
 
@@ -39,13 +39,13 @@ class RunConfig:
 
 
 def load_config(*overrides: str, name: str = "config") -> RunConfig:
-    """Build the config of the same words on a command line: `load_config("dataset=images", "dataset.root=video.mp4")`.
+    """Build the config from the words of a command line: `load_config("dataset=images", "dataset.root=video.mp4")`.
 
     Args:
         overrides: as for `emgs run`; `emgs run --help` lists them.
 
     Raises:
-        ValueError: an override names no key or option; the message names near ones.
+        ValueError: an override names no key or option; the message suggests similar ones.
     """
     config = compose(*overrides, name=name)
     try:
@@ -54,16 +54,16 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
         settings = OmegaConf.to_container(config, resolve=True, throw_on_missing=True)
     except InstantiationException as error:
         raise ValueError(message_of(error)) from error
-    except OmegaConfBaseException as error:  # a value that others refer to is missing or of another kind
+    except OmegaConfBaseException as error:  # a value that others refer to is missing or has the wrong type
         raise ValueError(f"{' '.join(overrides)}: {message_of(error)}") from error
     return RunConfig(settings=settings, slam=slam, densify=densify, evaluation=evaluation, graph=graph)
 
 
 def map_sequence(config: RunConfig, show_progress: bool = True, **stages: Stage) -> MappingRun:
-    """Map the sequence of a config; the run holds the map, and a record with a pose for every frame.
+    """Map the sequence of a config. The returned run holds the map, and a record with a pose for every frame.
 
     Args:
-        stages: functions in the place of those of a step, by the names of `slam.Stages`: `em_update=mine`.
+        stages: functions that replace stages of a step, by the names of `slam.Stages`: `em_update=mine`.
 
     Raises:
         ValueError: the data set, the prior or a frame cannot be used.

@@ -61,9 +61,9 @@ Stage = Callable[..., Any]
 
 
 class Stages(NamedTuple):
-    """The functions of a step that can be others: `map_sequence(config, em_update=mine)`.
+    """The stages of a step, each of which can be replaced: `map_sequence(config, em_update=mine)`.
 
-    Each takes and returns what the one in its place does. A program is compiled for the functions that it is made from.
+    A replacement takes and returns what the original does. A program is compiled for each set of functions.
     """
 
     initialize: Stage = initialize
@@ -80,16 +80,16 @@ class Stages(NamedTuple):
 
 
 class SlamConfig(eqx.Module):
-    """All stages.
+    """Configs of all stages.
 
     Args:
         window_size: |S|, images in the FIFO that the prior sees before the current one.
-        initialization: `merged` (printed): all views of the first window are clustered together; `incremental`: the
-            first view is, and the others are integrated one by one.
+        initialization: `merged` (printed) clusters all views of the first window together; `incremental` clusters the
+            first view and integrates the others one by one.
         extrapolation: of depth errors to points that no Gaussian explains.
         splitting: of Gaussians that are too coarse for a nearer view.
         existence: evidence of later frames for and against a Gaussian.
-        motion: what is taken for moving: it neither aligns a frame nor becomes map.
+        motion: which points are taken for moving; these are neither aligned nor mapped.
         stages: the functions themselves.
     """
 
@@ -109,7 +109,7 @@ class SlamConfig(eqx.Module):
 
     @property
     def fusion(self) -> "FusionConfig":
-        """Settings of the fusion alone: other ones compile it no second time."""
+        """Settings of the fusion only, so that changing others does not compile it again."""
         return FusionConfig(self.em, self.extrapolation, self.splitting, self.stages)
 
 
@@ -126,10 +126,10 @@ class SlamState(eqx.Module):
     """State between two steps.
 
     Args:
-        previous: the last frame as it was aligned, world frame.
+        previous: the last frame, aligned, world frame.
         estimate: uncertainty of its pose and scale.
-        time: frames so far, those that could not be placed included.
-        looks: of the frames before; None where nothing is taken for moving.
+        time: number of frames so far, lost ones included.
+        looks: of earlier frames; None if motion is off.
     """
 
     map: GaussianMap
@@ -141,7 +141,7 @@ class SlamState(eqx.Module):
 
 
 class Overflow(eqx.Module):
-    """Rows beyond a capacity: if either of the first two is not 0, the step must be repeated with more capacity."""
+    """Rows that did not fit. If either of the first two is not 0, repeat the step with more capacity."""
 
     map: Int[Array, ""]
     submap: Int[Array, ""]
@@ -152,10 +152,10 @@ class StepInfo(eqx.Module):
     """Diagnostics of one step.
 
     Args:
-        origin: median birth of the Gaussians that explain its points, its own if none do.
-        num_left_out: points of the current frame that no map can hold, or with a number that is not finite.
+        origin: median birth of the Gaussians that explain the frame's points; its own time if none do.
+        num_left_out: points of the frame that are beyond any map or not finite.
         moving: pixels of the thinned image that are taken for moving.
-        seen: the earlier frame of which no later one will say any more what moved in it.
+        seen: the frame that has just left the looks, with all that is known of what moved in it.
     """
 
     T_world_camera: jaxlie.SE3
@@ -172,10 +172,10 @@ class StepInfo(eqx.Module):
 
 
 class Submap(eqx.Module):
-    """M*, the part of the map that a step works on, with what is found once for all stages.
+    """M*, the part of the map that a step works on, with an index for all stages.
 
     Args:
-        rows: where they are in the whole map; its capacity where there is none.
+        rows: of the whole map; its capacity for empty rows.
     """
 
     map: GaussianMap
@@ -200,13 +200,13 @@ class Frame(eqx.Module):
 
     @property
     def seen(self) -> Observation:
-        """Its points, none of them valid where it is not tracked."""
+        """Its points; none is valid if the frame is not tracked."""
         points = self.points
         return eqx.tree_at(lambda o: o.valid, points, points.valid & self.localization.is_tracked)
 
     @property
     def trusted(self) -> Observation:
-        """Those of them that are not taken for moving."""
+        """The points of `seen` that are not taken for moving."""
         return _without(self.seen, self.moving)
 
 
@@ -214,8 +214,8 @@ class Fused(eqx.Module):
     """Submap after a frame's points are fused into it.
 
     Args:
-        unexplained: points that no Gaussian explains; their depth errors are extrapolated from the map's surfaces.
-        origin: median birth of the Gaussians that explain the others; the frame's own time where none does.
+        unexplained: points that no Gaussian explains, corrected by depth errors extrapolated from the map's surfaces.
+        origin: median birth of the Gaussians that explain the others; the frame's own time if none do.
     """
 
     map: GaussianMap
@@ -226,7 +226,7 @@ class Fused(eqx.Module):
 
 
 class NewGaussians(eqx.Module):
-    """Gaussians that a frame adds to the map: of its points, with their number of images, and halves of split ones."""
+    """Gaussians that a frame adds to the map: new ones with their number of images, and halves of split ones."""
 
     gaussians: Gaussians
     weight: Float[Array, "g"]
@@ -238,7 +238,7 @@ def _without(points: Observation, moving: Bool[Array, "p"]) -> Observation:
 
 
 def _first_weight(weight: Float[Array, "g"], config: AverageConfig) -> Float[Array, "g"]:
-    """Weight of a new Gaussian: α_0 = 1 as printed, or the number of images that its points amount to."""
+    """Give a new Gaussian its weight: α_0 = 1 as printed, or the number of images that its points amount to."""
     return jnp.where(config.gain > 0, weight, 1.0)
 
 
@@ -246,14 +246,14 @@ def _first_weight(weight: Float[Array, "g"], config: AverageConfig) -> Float[Arr
 def init_state(
     views: Observation, T_world_views: jaxlie.SE3, camera: Camera, config: SlamConfig
 ) -> tuple[SlamState, Int[Array, ""]]:
-    """The map of the first window, whose last view becomes the previous frame.
+    """Make the state after the first window: its map, with the last view as the previous frame.
 
     Args:
         views: the window's observations, camera frames, oldest first.
         camera: of the full images.
 
     Returns:
-        The state, and how many Gaussians did not fit into the map's capacity.
+        The state, and how many Gaussians did not fit into the map.
     """
     gaussians, weight, world = config.stages.initialize(
         views, T_world_views, camera, config.observation.thin, config.fit
@@ -271,7 +271,7 @@ def _first_state(
     view: Camera,
     config: SlamConfig,
 ) -> tuple[SlamState, Int[Array, ""]]:
-    # There is nothing else to align the second frame with, so the first window confirms itself.
+    # The second frame has nothing else to align with, so the first window confirms itself.
     existence = jnp.maximum(config.existence.birth, config.existence.hit)
     time = jnp.asarray(world.valid.shape[0], jnp.int32)
     new = new_map(gaussians, _first_weight(weight, config.em.average), existence, time - 1)
@@ -286,10 +286,10 @@ def _first_state(
 
 @full_precision
 def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig) -> tuple[SlamState, StepInfo]:
-    """Integrate one frame: localise, select, E-step, M-step, refine, insert (the paper's pipeline figure).
+    """Integrate one frame: localize, select, E-step, M-step, refine, insert (the paper's pipeline figure).
 
-    Called as it is, each stage is an executable of its own, so that a larger map compiles the look-up and the insertion
-    anew and not the work on the submap; inside another jit or vmap all of it is one, which rounds differently.
+    Called directly, each stage is its own executable, so a larger map recompiles selection and insertion but not the
+    work on the submap. Inside another jit or vmap everything is one program, which rounds differently.
 
     Args:
         camera: of the full images.
@@ -338,7 +338,7 @@ def _localize_coarse(
     config: LocalizationConfig,
     stages: Stages,
 ) -> tuple[CoarsePose, Observation, Observation, Int[Array, ""]]:
-    """The coarse pose, the current frame as it is sound and placed by that pose, and how many points it has lost."""
+    """Compute the coarse pose, the frame without unusable points, the same at that pose, and how many were left out."""
     current, before = sound(prediction.current), sound(prediction.previous)
     num_left_out = jnp.sum(prediction.current.valid & ~current.valid)
     prediction = replace(
@@ -371,7 +371,7 @@ def _find_movers(
     config: MotionConfig,
     stages: Stages,
 ) -> Bool[Array, "p"]:
-    """What moves in a frame at its coarse pose."""
+    """Find what moves in a frame at its coarse pose."""
     if looks is None:
         return jnp.zeros(current.valid.shape, bool)
     points = transform(jaxlie.SE3.identity(), current, coarse.scale)
@@ -383,7 +383,7 @@ def _find_movers(
 def _look(
     looks: Looks, frame: Frame, T_world_previous: jaxlie.SE3, view: Camera, config: MotionConfig
 ) -> tuple[Looks, Seen]:
-    """The looks after a frame, and the one that is none any more, as the frames after it show it."""
+    """Update the looks by a frame; return them and the oldest one, which leaves them, with the evidence about it."""
     estimate, T = frame.localization.estimate, frame.T_world_camera
     told = look_back(looks, frame.seen, frame.moving, T, T_world_previous, estimate, view, config)
     after, is_over = look_again(told, frame.seen, frame.moving, T, frame.time, view), jnp.any(frame.seen.valid)
@@ -393,7 +393,7 @@ def _look(
 
 @full_precision
 def as_seen(look: Looks, T_world_last: jaxlie.SE3, depth_noise: Float[Array, ""]) -> Seen:
-    """One look as what later frames have found that it saw; `depth_noise` is that of the last frame."""
+    """Summarise a look by what later frames found to move in it; `depth_noise` is that of the last frame."""
     moves = look.moving & ~look.said
     return Seen(look.depth, moves, T_world_last @ look.T_previous_look, depth_noise, look.time)
 
@@ -408,7 +408,7 @@ def _localize_fine(
     config: LocalizationConfig,
     stages: Stages,
 ) -> Frame:
-    """The frame at its fine pose, against what is confirmed."""
+    """Register the frame to the confirmed Gaussians."""
     target = confirmed(submap.map)
     groups = group_points(target.means, target.valid, order_of(submap.index.groups, target.valid.shape[0]))
     index = GaussianIndex(submap.index.white, groups)
@@ -419,7 +419,7 @@ def _localize_fine(
 
 @executable
 def _fuse(submap: Submap, frame: Frame, view: Camera, num_rows: int, config: FusionConfig) -> Fused:
-    """Fuse the points of a frame that is tracked, and split what they show to be too coarse."""
+    """Fuse the points of a tracked frame, and split Gaussians that they show to be too coarse."""
     T, trusted = frame.T_world_camera, frame.trusted
     noise = frame.localization.noise[:, None] * (trusted.points - T.translation())
     map, explained, info = config.stages.em_update(submap.map, trusted, noise, config.em, submap.index)
@@ -430,10 +430,10 @@ def _fuse(submap: Submap, frame: Frame, view: Camera, num_rows: int, config: Fus
     explained_by, noise = take_rows(submap.map, owned), frame.localization.noise
     moved = config.stages.extrapolate(trusted, explained_by, explained.is_fused, noise, T, view, config.extrapolation)
     unexplained = eqx.tree_at(lambda o: o.valid, moved, trusted.valid & ~explained.is_fused)
-    # The frame was moved onto the map, the mean of W frames: 1 / (W + 1) of what they differ is the map's own error.
+    # The frame was moved onto the map, the mean of W frames: 1 / (W + 1) of their difference is the map's own error.
     weight = median(explained_by.weight, explained.is_fused)
     share = jnp.where(info.num_fused > 0, 1.0 / (weight + 1.0), 0.0)
-    # All of the image alike, fused or not, so that no surface tears.
+    # The whole image moves uniformly, fused or not, so that no surface tears.
     places = lambda s: (s[0].gaussians.means, s[1].gaussians.means, s[2].points)  # noqa: E731
     surface = map, halves, unexplained
     means = [moved_by_field(points, frame.localization.icp.field, share, T) for points in places(surface)]
@@ -468,7 +468,7 @@ def _store(
     view: Camera,
     config: SlamConfig,
 ) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
-    """Write the submap back, existence updated and duplicates merged; put new Gaussians and halves into free rows.
+    """Write the submap back, update existence, merge duplicates, and insert new Gaussians and halves into free rows.
 
     Returns:
         The map, the number of its Gaussians, how many did not fit, and the time of the next frame.

@@ -1,4 +1,4 @@
-"""Splitting: a Gaussian that is seen closer than when it was made and no longer explains its points becomes two."""
+"""Splitting: a Gaussian that is seen from nearer than when it was made, and contradicts its points, becomes two."""
 
 import math
 
@@ -16,15 +16,15 @@ from emgs_jax.ops.pytree import put_rows, static, take_rows, traced
 
 
 class SplittingConfig(eqx.Module):
-    """When one Gaussian is too few.
+    """When to split a Gaussian.
 
     Args:
-        max_splits: in one frame; 0 none, as printed.
+        max_splits: in one frame; 0: none, as printed.
         min_points: of one frame, in units of those that make a new Gaussian; 4 is a surface at half the distance.
-        color_std: RGB; a larger deviation of the points from the Gaussian's colour is not explained.
-        min_normal_cos: likewise a smaller mean cosine between their normals and its own.
-        num_std: likewise a spread across the surface of more standard deviations of their noise.
-        min_std: m; the floor of the covariances; what is hardly wider stays one.
+        color_std: RGB; a larger deviation of the points from the Gaussian's colour contradicts it.
+        min_normal_cos: so does a smaller mean cosine between their normals and its own,
+        num_std: and a spread across the surface of more standard deviations of their noise.
+        min_std: m; floor of the covariances; a Gaussian that is hardly wider is not split.
     """
 
     max_splits: int = static(low=0, high=2**20)
@@ -43,13 +43,13 @@ def is_too_coarse(
     spacing: int,
     config: SplittingConfig,
 ) -> Bool[Array, "n"]:
-    """Gaussians with more points than one needs, whose colours, normals or distances from its plane they contradict.
+    """Find Gaussians with more points than one needs, if these points contradict its colour, normal or plane.
 
     Args:
         gaussians: n of them, world frame.
         points: m of them, world frame.
-        noise: of each along its viewing ray, a vector, m.
-        owners: the Gaussian that explains each point best; n where none does.
+        noise: of each point along its viewing ray, a vector, m.
+        owners: the Gaussian that explains each point best; n for none.
         spacing: points that make a new Gaussian.
     """
     own = take_rows(gaussians, owners)
@@ -71,11 +71,11 @@ def is_too_coarse(
 
 
 def halves(map: GaussianMap, min_std: Float[Array, ""]) -> tuple[GaussianMap, GaussianMap, Float[Array, "n"]]:
-    """Every Gaussian cut through its mean, across its longer tangential axis e.
+    """Cut every Gaussian through its mean, across its longer tangential axis e.
 
     The halves of N(μ, S) have means μ ± √(2/π) s and the covariance S - 2/π s s', for s = S e / √(e' S e): together
-    they have its mean and covariance. S is Σ without the floor min_std² I, which both halves keep, and half of the
-    weight; colour, normal, feature and existence are the whole one's.
+    they have its mean and covariance. S is Σ without the floor min_std² I, which both halves keep. Each gets half of
+    the weight; colour, normal, feature and existence stay.
 
     Returns:
         Both halves, and e' S e.
@@ -107,12 +107,12 @@ def split(
     spacing: int,
     config: SplittingConfig,
 ) -> tuple[GaussianMap, GaussianMap]:
-    """Replace what is too coarse by one half of it.
+    """Replace Gaussians that are too coarse by one of their halves.
 
-    Arguments as of `is_too_coarse`.
+    Arguments as in `is_too_coarse`.
 
     Returns:
-        The map, and `max_splits` rows with the other halves, valid where there is one.
+        The map, and `max_splits` rows with the other halves.
     """
     is_coarse = is_too_coarse(map.gaussians, points, noise, owners, spacing, config)
     rows, exists, _ = compact_rows(is_coarse, config.max_splits)

@@ -1,4 +1,4 @@
-"""Surface extrapolation: new surface continues the depth error of the map's surface beside it, so that both join."""
+"""Surface extrapolation: new surface continues the depth error of the mapped surface beside it, so that both join."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,16 +12,16 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import traced
 from emgs_jax.registration.depth_field import depth_errors
 
-LEAST_POWER = 1e-18  # of errors, squared logarithms of depth; less are rounding, and say nothing of each other
+LEAST_POWER = 1e-18  # of errors, squared logarithms of depth; smaller ones are rounding and predict nothing
 
 
 class ExtrapolationConfig(eqx.Module):
     """Extrapolation of a frame's depth errors from observed surfaces to the new surface beside them.
 
     Args:
-        width: of the Gaussian window over which errors are averaged, its standard deviation as a fraction of the
-            image's width; 0: new points stay where the frame puts them, as printed.
-        max_error: of a logarithm of depth; a larger one is no error but another surface.
+        width: standard deviation of the Gaussian window over which errors are averaged, as a fraction of the image's
+            width; 0: new points stay where the frame puts them, as printed.
+        max_error: of a logarithm of depth; a larger difference is another surface.
         min_cos: between a Gaussian's normal and the ray; a more grazing view does not show where along it the plane
             lies.
     """
@@ -38,7 +38,7 @@ def depth_error(
     center: Float[Array, "3"],
     config: ExtrapolationConfig,
 ) -> tuple[Float[Array, "p"], Bool[Array, "p"]]:
-    """`depth_errors` of the points that were fused, as far as they are no other surface, and where; 0 elsewhere."""
+    """Compute `depth_errors` of fused points that are no other surface, and which these are; 0 elsewhere."""
     gaussians = explained_by.gaussians
     error, is_known = depth_errors(points, gaussians.means, gaussians.normals, center, config.min_cos)
     is_known &= is_fused & (jnp.abs(error) <= config.max_error)
@@ -46,7 +46,7 @@ def depth_error(
 
 
 def window(length: int, std: Float[Array, ""]) -> Float[Array, "l l"]:
-    """exp(-½ (i - j)² / std²) for all rows (or columns) i and j of an image; the identity where `std` is 0."""
+    """Compute exp(-½ (i - j)² / std²) for all rows (or columns) i, j of an image; the identity if `std` is 0."""
     apart = jnp.arange(length) - jnp.arange(length)[:, None]
     return jnp.where(apart == 0, 1.0, jnp.exp(-0.5 * (apart / jnp.maximum(std, 1e-6)) ** 2))
 
@@ -63,19 +63,19 @@ def extrapolate(
 ) -> Observation:
     """Extrapolate depth errors: move points that no Gaussian explains along their rays by their neighbours' error.
 
-    The depth errors of a prediction are similar over much of an image. So the points that the map does explain predict
-    the errors of those beside them, with ρ of `depth_error`, the precision v = (σ_min / σ)² of each point, and g the
-    window:
+    The depth errors of a prediction are similar over much of an image. So points that the map explains predict the
+    errors of those beside them. With ρ of `depth_error`, the precision v = (σ_min / σ)² of each point, and the window
+    g:
 
         ρ̂ = b Σ g v ρ W / (W + 1) / (1 + Σ g v),   x <- c + (x - c) exp(-ρ̂)
 
     W frames made the Gaussian, so its own error has 1 / W of one frame's variance, and only W / (W + 1) of the
-    difference is the frame's. b in [0, 1] is how well neighbours predict a point's error in this frame: the slope of ρ
-    over its own prediction from all others. Where errors are not similar b is 0, and nothing moves.
+    difference is the frame's. b in [0, 1] measures how well neighbours predict a point's error in this frame: the slope
+    of ρ over its prediction from all others. If errors are not similar, b is 0 and nothing moves.
 
     Args:
         aligned: the frame, world frame, one row a pixel of `camera`.
-        explained_by: the Gaussian that explains each point best, as it was before this frame, and its weight W.
+        explained_by: the Gaussian that explains each point best, before this frame, with its weight W.
         noise: of each point, as a fraction of its depth.
         camera: of the rows.
     """

@@ -140,7 +140,8 @@ def test_the_site_builds_without_a_warning_and_has_every_key_and_name(tmp_path):
     words = ["build", "--strict", "--quiet", "--config-file", str(ROOT / "mkdocs.yml"), "--site-dir", str(tmp_path)]
     done = subprocess.run([sys.executable, "-m", "mkdocs", *words], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
-    keys = (tmp_path / "keys.html").read_text()
+    keys = (tmp_path / "every_key.html").read_text()
     assert all(str(path.relative_to(CONF)) in keys for path in CONF.rglob("*.yaml"))
+    assert "The keys that people change" in (tmp_path / "keys.html").read_text(), "a page of docs/ is not replaced"
     names = (tmp_path / "names.html").read_text()
     assert all(f'id="{name.lower()}"' in names for name in emgs_jax.__all__ if name != "__version__")

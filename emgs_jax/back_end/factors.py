@@ -20,15 +20,14 @@ from emgs_jax.registration.pose_noise import LEAST_NOISE
 class NoiseConfig:
     """Standard deviations of pose factors, as multiples of the relative depth noise ν of a frame's points.
 
-    A rotation has the standard deviation k ν, a translation k ν z with the median depth z: the factors k have no unit,
-    and a prior that is twice as noisy gets half the weight.
-
-    The values make χ² one for each measured row on walks of the simulated prior.
+    A rotation has the standard deviation k ν, a translation k ν z with the median depth z. So the factors k have no
+    unit, and a prior that is twice as noisy gets half the weight. With these values χ² is one per measured row on walks
+    of the simulated prior.
 
     Args:
-        pair: of the relative pose of two consecutive frames; √n times as much for frames n apart.
-        map: of a frame registered to the map, relative to the frame whose Gaussians it was registered to.
-        log_scale: of the log-ratio of two consecutive frames' scales, as `pair`.
+        pair: of the relative pose of two consecutive frames; √n times that for frames n apart.
+        map: of a frame relative to the frame whose Gaussians it was registered to.
+        log_scale: of the log-ratio of two consecutive frames' scales, like `pair`.
         depth: ν of a frame that was not registered to the map, such as the first.
     """
 
@@ -40,7 +39,7 @@ class NoiseConfig:
 
 @dataclass(frozen=True)
 class FrameData:
-    """Input of the back end from one frame, beside its pose.
+    """Input of the back end from one frame, besides its pose.
 
     Args:
         index: in the data set.
@@ -49,8 +48,8 @@ class FrameData:
         mask: of these, (h, w).
         T_anchor_views: by frame index, the poses (4, 4) that its inference predicts; some may not be finite.
         covariance: (6, 6) of its pose, see `FrameRecord`; None without one.
-        depth_noise: ν of the points, as they differ from the map; None where the frame was not tracked: the few points
-            that are near the map by chance do not count.
+        depth_noise: ν, the points' difference from the map; None if the frame was not tracked, because a few points
+            near the map by chance do not count.
     """
 
     index: int
@@ -63,7 +62,7 @@ class FrameData:
 
     @property
     def depth(self) -> float:
-        """The points' median z, m of its inference; 1 where there are none."""
+        """Median z of the points, m of its inference; 1 without points."""
         return float(np.median(self.points[self.mask][:, 2])) if self.mask.any() else 1.0
 
 
@@ -79,7 +78,7 @@ class Factor(NamedTuple):
 
 
 def _weights(frame: FrameData, noise: NoiseConfig, angle: float, log_scale: float = np.inf) -> np.ndarray:
-    """Square root (7, 7) of the information of independent errors, in multiples of ν; an infinite one gets weight 0."""
+    """Compute the root (7, 7) of the information of independent errors, in multiples of ν; infinite ones get 0."""
     depth_noise = noise.depth if frame.depth_noise is None else max(frame.depth_noise, LEAST_NOISE)
     return np.diag(1.0 / (depth_noise * np.array([angle * frame.depth] * 3 + [angle] * 3 + [log_scale])))
 
@@ -93,14 +92,13 @@ def sequential_factor(
 ) -> Factor | None:
     """Build the last frame's sequential factor to the nearest earlier frame in its window; None without one.
 
-    The measurement is the estimated pose, not the predicted one. The map was made at these poses: a prediction that
-    differs from them by its noise would move every frame by that, each with the Gaussians of its birth, and roughen all
-    surfaces.
+    The measurement is the estimated pose, not the predicted one, because the map was made at the estimated poses. Noisy
+    predictions would move every frame together with the Gaussians that it made, and roughen all surfaces.
 
     Args:
-        poses: T_world_camera (4, 4) of all nodes, the last one its own; that of a frame k before it is k before.
+        poses: T_world_camera (4, 4) of all nodes, in order of time; the last one is this frame's.
         log_scales: σ of all nodes, likewise.
-        is_connected: true for a node that a factor may join: its pose is an estimate and no placeholder.
+        is_connected: tells whether a factor may join a node: its pose is an estimate, not a placeholder.
     """
     time = len(poses) - 1
     known = {index for index, pose in frame.T_anchor_views.items() if np.isfinite(pose).all()}
@@ -118,13 +116,13 @@ def sequential_factor(
 def map_factor(
     frame: FrameData, poses: Sequence[np.ndarray], log_scales: Sequence[float], origin: int, noise: NoiseConfig
 ) -> Factor:
-    """Build the map factor: the last frame's pose relative to the frame `origin` whose Gaussians it was fitted to."""
+    """Build the map factor: the last frame's pose relative to frame `origin`, whose Gaussians it was registered to."""
     measured = _relative_pose(poses, log_scales, origin)
     return Factor(len(poses) - 1, origin, measured, 0.0, _weights(frame, noise, noise.map), is_loop=False)
 
 
 def _relative_pose(poses: Sequence[np.ndarray], log_scales: Sequence[float], row: int) -> np.ndarray:
-    """Node `row` relative to the last one, in the unit of the last one's inference."""
+    """Compute the pose of node `row` relative to the last one, in the unit of the last one's inference."""
     return scale_pose(np.linalg.inv(poses[-1]) @ poses[row], np.exp(-log_scales[-1]))
 
 
@@ -134,7 +132,7 @@ def loop_factor(loop: LoopMeasurement) -> Factor:
 
 
 def stack_factors(factors: Sequence[Factor]) -> Factors:
-    """Stack factors as float32 arrays, padded to a power of two: a growing graph compiles rarely."""
+    """Stack factors as float32 arrays, padded to a power of two so that a growing graph compiles rarely."""
     count = len(factors)
     size = bucket(count)
     a, b, Z, ratios, weights, is_loop = zip(*factors, *[factors[0]] * (size - count), strict=True)

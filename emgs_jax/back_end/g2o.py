@@ -1,4 +1,4 @@
-"""Pose graphs written in g2o's format, for other solvers: `VERTEX_SE3:QUAT` and `EDGE_SE3:QUAT`."""
+"""Write pose graphs in g2o's format, for other solvers: `VERTEX_SE3:QUAT` and `EDGE_SE3:QUAT`."""
 
 import os
 
@@ -18,7 +18,7 @@ def save_graph_g2o(path: str | os.PathLike, graph: PoseGraph) -> None:
     The information is on (translation, rotation vector), as GTSAM reads the format; g2o itself halves the angles.
 
     Raises:
-        ValueError: a scale is not 1: the format has none.
+        ValueError: a scale is not 1; the format has no scales.
     """
     nodes, edges = graph.nodes, graph.factors
     valid = np.asarray(nodes.valid)

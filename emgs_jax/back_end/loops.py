@@ -1,4 +1,4 @@
-"""Loops: detected by keyframes, verified, measured again by the prior, and consistent with each other."""
+"""Loops: detect them by keyframes, verify them, query the prior, and check spatial consistency."""
 
 import math
 from collections.abc import Sequence
@@ -41,9 +41,9 @@ def detect_loops(end: BackEnd, frame: FrameData) -> BackEnd:
 
 
 def detect_loops_between(end: BackEnd, submap_id: int) -> BackEnd:
-    """Verify loops of all keyframes of a submap, whose unit may be another, with those of the active one.
+    """Verify loops between all keyframes of a submap, whose unit may differ, and those of the active one.
 
-    Its nodes come after those of the active one.
+    The submap's nodes come after those of the active one.
     """
     config, is_placed = end.config.place_recognition, [end.nodes[one.frame].is_placed for one in end.database.keyframes]
     known, queries = (
@@ -57,7 +57,7 @@ def detect_loops_between(end: BackEnd, submap_id: int) -> BackEnd:
 
 
 def recent_loops(end: BackEnd) -> list[LoopMeasurement]:
-    """Select spatially consistent loops of the last queries that are not in the pose graph yet, after a keyframe."""
+    """Select spatially consistent loops of the latest queries that are not in the pose graph yet, after a keyframe."""
     time = len(end.nodes) - 1
     if time % end.config.every:
         return []
@@ -71,10 +71,10 @@ def _keyframe(end: BackEnd, time: int, frame: FrameData) -> Keyframe:
 def relocalize_frame(
     end: BackEnd, frame: FrameData, in_other_submap: bool = False
 ) -> tuple[RelocalizedPose | None, str | None]:
-    """Relocalize a frame by keyframes of its submap that are in the map; else return why that fails.
+    """Relocalize a frame by keyframes of its submap that are in the map; return its pose, or why that fails.
 
     Args:
-        frame: of a frame that is no node yet, or is no keyframe.
+        frame: a frame that is not a node yet, or not a keyframe.
         in_other_submap: search the other submap that has the most similar keyframe, with a free ratio of units.
     """
     query = _keyframe(end, len(end.nodes), frame)
@@ -88,7 +88,7 @@ def relocalize_frame(
 
 
 def _most_similar_submap(end: BackEnd, query: Keyframe) -> int | None:
-    """Find the other submap with the most similar keyframe that is in the map; None without one."""
+    """Find the other submap with the most similar keyframe that is in its map; None without one."""
     keyframes = end.database.keyframes
     others = [row for row in range(len(keyframes)) if _submap_id_of(end, row) != end.active]
     others = [row for row in others if end.nodes[keyframes[row].frame].is_placed]
@@ -97,12 +97,12 @@ def _most_similar_submap(end: BackEnd, query: Keyframe) -> int | None:
 
 
 def _submap_id_of(end: BackEnd, row: int) -> int:
-    """Submap of a keyframe, a row of the database."""
+    """Look up the submap of a keyframe, a row of the database."""
     return end.nodes[end.database.keyframes[row].frame].submap
 
 
 def _verification_config(end: BackEnd, is_free: bool) -> VerificationConfig:
-    """Settings of the verification; the ratio of the two units is free where they may differ."""
+    """Return the settings of verification; the ratio of the two units is free if they may differ."""
     config = end.config.verification
     if end.has_one_unit and not is_free:
         return config
@@ -110,7 +110,7 @@ def _verification_config(end: BackEnd, is_free: bool) -> VerificationConfig:
 
 
 def consistent_loops(end: BackEnd, since: int = 0) -> list[LoopMeasurement]:
-    """Return the verified loops of queries from `since` on that are spatially consistent with others."""
+    """Select the verified loops of queries from `since` on that are spatially consistent with others."""
     recent = [loop for loop in end.verified if loop.b >= since]
     poses, log_scales = (dict(enumerate(values)) for values in (end.poses, end.log_scales))
     yes = spatially_consistent(recent, end.violating, poses, log_scales, end.config.consistency)
@@ -124,7 +124,7 @@ def not_in_graph(end: BackEnd, loops: Sequence[LoopMeasurement]) -> list[LoopMea
 
 
 def remove_inconsistent(end: BackEnd) -> BackEnd:
-    """Remove the factors of accepted loops that are not spatially consistent any more."""
+    """Remove the factors of accepted loops that are no longer spatially consistent."""
     good = {(loop.a, loop.b) for loop in consistent_loops(end)}
     accepted = [loop for loop in end.accepted if (loop.a, loop.b) in good]
     factors = [one for one in end.factors if not one.is_loop or (one.a, one.b) in good]
@@ -171,8 +171,8 @@ def loop_chi2(end: BackEnd, loop: LoopMeasurement) -> float:
 def query_prior(end: BackEnd, loops: Sequence[LoopMeasurement], query: PriorQuery) -> BackEnd:
     """Query the prior for loops, each once: a measurement that fits is fused, any other rejects the loop.
 
-    A rejected loop is evidence against all loops that imply the same correction, as a free-space violation is. A loop
-    without an answer stays as it is; so does one with a frame of another run.
+    A rejected loop is evidence against all loops that imply the same correction, like a free-space violation. A loop
+    without an answer stays as it is, and so does one with a frame of another run.
     """
     keyframes = {keyframe.frame: keyframe for keyframe in end.database.keyframes}
     for loop in _loops_to_query(end, loops):
@@ -201,7 +201,7 @@ def query_prior(end: BackEnd, loops: Sequence[LoopMeasurement], query: PriorQuer
 
 
 def _loops_to_query(end: BackEnd, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
-    """Select new loops with most inliers: the best of each query frame, and of these `max_queries`."""
+    """Select new loops with most inliers: the best of each query frame, at most `max_queries`."""
     new = [loop for loop in loops if (loop.a, loop.b) not in end.queries and loop.a >= end.first_node]
     best = {loop.b: loop for loop in sorted(new, key=lambda loop: loop.num_inliers)}
     return sorted(best.values(), key=lambda loop: -loop.num_inliers)[: end.config.prior_query.max_queries]

@@ -1,4 +1,4 @@
-"""Optimization of the pose graph, and deformation of a run's state: map, last frame and its pose follow the nodes."""
+"""Optimize the pose graph and deform the state of a run: map, last frame and its pose follow the nodes."""
 
 import math
 from collections.abc import Sequence
@@ -27,13 +27,13 @@ from emgs_jax.registration.pose_estimate import rescale_estimate
 from emgs_jax.registration.rigid import scale_translation
 from emgs_jax.slam import SlamState
 
-move_map, _move_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)  # a map is compiled for once
+move_map, _move_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)  # compiled once per size of the map
 _merge, _one_layer = eqx.filter_jit(merge_all_duplicates), eqx.filter_jit(one_layer)
 
 
 @full_precision
 def close_loops(end: BackEnd, state: SlamState, loops: Sequence[LoopMeasurement] = ()) -> tuple[BackEnd, SlamState]:
-    """Optimize with `loops` as further factors and deform the map; a refused solution moves nothing."""
+    """Optimize with `loops` as additional factors and deform the map; a refused solution moves nothing."""
     factors = [*end.factors, *map(loop_factor, loops)]
     before, solver = nodes_of(end, end.active), end.config.solver
     if not end.has_one_unit:  # the scales are not all about 1
@@ -55,7 +55,7 @@ def close_loops(end: BackEnd, state: SlamState, loops: Sequence[LoopMeasurement]
 
 
 def nodes_of(end: BackEnd, submap_id: int | None = None) -> Nodes:
-    """Stack all nodes, or mark those of a submap as valid; padded to a power of two, so that it compiles rarely."""
+    """Stack all nodes, of which only those of a submap are valid if it is given; padded to a power of two."""
     count = len(end.nodes)
     size = bucket(count)
     poses = to_se3(np.stack([*end.poses, *[np.eye(4)] * (size - count)]))
@@ -65,7 +65,7 @@ def nodes_of(end: BackEnd, submap_id: int | None = None) -> Nodes:
 
 
 def deform_state(state: SlamState, before: Nodes, after: Nodes, min_std: float, config: DeformConfig) -> SlamState:
-    """Deform the map and the last frame from the poses `before` to those `after`; earlier looks grow as it does."""
+    """Deform the map and the last frame from the poses `before` to `after`; earlier looks scale with the last frame."""
     last = state.time - 1
     looks, growth = state.looks, jnp.exp(after.log_scale[last] - before.log_scale[last])
     if looks is not None:
@@ -88,7 +88,7 @@ def merge_duplicates_of_state(state: SlamState, end: BackEnd, config: ExistenceC
 
 
 def one_layer_of_state(state: SlamState, end: BackEnd, is_other: Sequence[bool], config: ExistenceConfig) -> SlamState:
-    """Make one layer of what some nodes have made and of what the others have, see `one_layer`."""
+    """Make one layer of the Gaussians of some nodes and those of the others, see `one_layer`."""
     noise, is_other = depth_noise_of(end), jnp.asarray(is_other)[state.map.birth]
     if noise is None:
         return state
@@ -96,17 +96,17 @@ def one_layer_of_state(state: SlamState, end: BackEnd, is_other: Sequence[bool],
 
 
 def depth_noise_of(end: BackEnd) -> Float[Array, ""] | None:
-    """Median ν of the nodes that were registered to the map; None where none was."""
+    """Compute the median ν of the nodes that were registered to the map; None without any."""
     noise = [node.depth_noise for node in end.nodes if node.is_placed and node.depth_noise is not None]
     return jnp.asarray(np.median(noise), jnp.float32) if noise else None
 
 
 def _origins(end: BackEnd, state: SlamState) -> Float[Array, "n 3"]:
-    """Where the camera was by which each Gaussian was made, world frame."""
+    """Look up the centre of the camera that made each Gaussian, world frame."""
     return take_rows(nodes_of(end, end.active).T_world.translation(), state.map.birth)
 
 
 def _moved_pose(T: jaxlie.SE3, before: Nodes, after: Nodes, row: int) -> jaxlie.SE3:
-    """Return the node's new pose; T itself, bit for bit, where the node stays."""
+    """Return the node's new pose; T itself, bit for bit, if the node stays."""
     old, new = before.T_world.wxyz_xyz[row], after.T_world.wxyz_xyz[row]
     return jaxlie.SE3(jnp.where(jnp.all(old == new), T.wxyz_xyz, new))

@@ -1,6 +1,6 @@
 """places.npz: a run's back end, beside map.npz, so that another run can continue in the map.
 
-Keyframes, poses and factors. The other run's frames are further nodes of the same pose graph.
+It holds keyframes, poses and factors. The frames of the new run become further nodes of the same pose graph.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -12,7 +12,7 @@ import numpy as np
 
 from emgs_jax.back_end.factors import Factor
 from emgs_jax.back_end.state import BackEnd, BackEndConfig, Node
-from emgs_jax.data.reading import fingerprint
+from emgs_jax.data.reading import fingerprint, resize_nearest
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.map_file import load_map
 from emgs_jax.io.npz import load_headed, save_headed
@@ -29,20 +29,20 @@ NODES = {
     "log_scales": "log_scale",
     "frames": "frame",
     "is_placed": "is_placed",
-}  # in the file: of a node
-LOOPS = {"verified": "verified", "contradicted": "violating", "accepted": "accepted"}  # in the file: in a back end
+}  # name in the file: of a node
+LOOPS = {"verified": "verified", "contradicted": "violating", "accepted": "accepted"}  # name in the file: in a back end
 OF_POINTS, OF_KEYFRAMES = ("pixels", "descriptors", "points"), ("frame", "intrinsics", "size", "depths")
 
 
 @dataclass(frozen=True)
 class SavedMap:
-    """A map of an earlier run in which another one continues.
+    """A map of an earlier run that another run continues.
 
     Args:
         map: of an earlier run.
-        back_end: of that run; its `first_node` is that of the next one.
-        depth_noise: how much a frame differed from the map, as a fraction of its depth.
-        is_frozen: True in localization mode: the map stays as it is.
+        back_end: of that run; its `first_node` is that of the next run.
+        depth_noise: median difference of a frame from the map, as a fraction of its depth.
+        is_frozen: True in localization mode, in which the map stays as it is.
         checksum: of its files.
     """
 
@@ -59,8 +59,13 @@ class SavedMap:
 
 
 def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
+<<<<<<< HEAD
     """Write what `load_places` reads."""
+    keyframes = _on_one_grid(end.database.keyframes)
+=======
+    """Write the file that `load_places` reads."""
     keyframes = end.database.keyframes
+>>>>>>> h3
     header = HEADER | {
         "depth_noise": depth_noise,
         "num_trained": end.database.num_trained,
@@ -80,11 +85,20 @@ def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
     save_headed(path, header, arrays)
 
 
+def _on_one_grid(keyframes: Sequence[Keyframe]) -> list[Keyframe]:
+    """Keyframes with depths on the grid of the first one: merged runs may have had others."""
+    shape = keyframes[0].depths.shape
+    return [
+        one if one.depths.shape == shape else replace(one, depths=resize_nearest(one.depths, shape[::-1]))
+        for one in keyframes
+    ]
+
+
 def load_places(path: Path, end: BackEnd) -> tuple[BackEnd, float]:
-    """Fill a back end that has no node yet; return it, and the depth noise.
+    """Read places.npz into a back end that has no node yet; return it, and the depth noise.
 
     Raises:
-        ValueError: the file is damaged, of another version, or its descriptors are of another kind.
+        ValueError: the file is damaged or of another version, or its descriptors are of another kind.
     """
     try:
         header, arrays = load_headed(path, HEADER)
@@ -105,11 +119,11 @@ def load_places(path: Path, end: BackEnd) -> tuple[BackEnd, float]:
 def load_saved_map(
     folder: str | None, mode: str, config: BackEndConfig | None, intrinsics: Sequence[float], min_std: float
 ) -> SavedMap | None:
-    """The map of a finished run's folder; None without one.
+    """Load the map in the folder of a finished run; None without a folder.
 
     Args:
         mode: `extend` or `localize`.
-        intrinsics: of the new images, which may be those of another camera.
+        intrinsics: of the new images, which may be from another camera.
 
     Raises:
         ValueError: the folder is not that of a finished run with a back end, or a file of it cannot be used.
@@ -199,7 +213,7 @@ def _table(name: str, records: Sequence[Any], fields: Iterable[str]) -> dict[str
 
 
 def _rows(name: str, arrays: Mapping[str, np.ndarray], fields: Iterable[str], count: int) -> list[dict[str, Any]]:
-    """Return the records that `_table` was made of, a dict each; a and b must be among `count` nodes."""
+    """Return the records from which `_table` was made, one dict each; a and b must be among `count` nodes."""
     columns = {field: arrays[f"{name}.{field}"] for field in fields}
     for field in ("a", "b"):
         if len(columns[field]) and not 0 <= columns[field].min() <= columns[field].max() < count:

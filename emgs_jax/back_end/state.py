@@ -1,6 +1,6 @@
 """The back end: a pose graph of keyframes and loop closures; optimized poses deform the map.
 
-Nodes are the frames from the first of the map on, in the order of `SlamState.time`.
+Nodes are the frames from the first one of the map on, in the order of `SlamState.time`.
 """
 
 import math
@@ -29,10 +29,10 @@ class BackEndConfig:
 
     Args:
         every: frames between keyframes.
-        min_violation: χ² of a loop at the current poses beyond which it violates them: only such a loop starts a
-            closure, and only for such a loop the prior is queried.
+        min_violation: χ² of a loop at the current poses beyond which it violates them. Only such a loop starts a
+            closure and a query of the prior.
         min_frames: between two closures.
-        deform: of the map, to follow the optimized poses.
+        deform: deformation of the map with the optimized poses.
     """
 
     noise: NoiseConfig = field(default_factory=NoiseConfig)
@@ -54,14 +54,14 @@ class Node:
 
     Args:
         pose: current T_world_camera (4, 4).
-        online: the same as first estimated, in the unit of `pose`.
+        online: the pose as first estimated, in the unit of `pose`.
         log_scale: σ of its inference.
         frame: index in the data set.
         submap: disconnected submap that holds it; the relative pose of two submaps is not known.
         is_placed: True in the map: the frame is neither degraded nor lost.
-        covariance: (6, 6) of `online`, see `FrameRecord`; None where it has none, or is of a saved map, which is exact.
-        origin: node whose Gaussians it was registered to; None where it was not.
-        depth_noise: how much its points differ from the map, as a fraction of their depth; None where it was not.
+        covariance: (6, 6) of `online`, see `FrameRecord`; None without one, or in a saved map, which counts as exact.
+        origin: node whose Gaussians it was registered to; None if it was not registered.
+        depth_noise: difference of its points from the map, as a fraction of their depth; None if it was not registered.
     """
 
     pose: np.ndarray
@@ -95,10 +95,10 @@ class Refusal(NamedTuple):
 
 @dataclass(frozen=True)
 class BackEnd:
-    """State of the back end: nodes, factors and loops of the pose graph so far. Nothing of it is ever changed in place.
+    """State of the back end: nodes, factors and loops of the pose graph. Immutable: functions return a new one.
 
     Args:
-        config: None: nodes alone, poses stay as first estimated.
+        config: None: nodes only; poses stay as first estimated.
         min_std: floor of the map's covariances.
         database: keyframes; their `frame` is the node.
         verified: loops that passed every gate of two keyframes.
@@ -107,10 +107,10 @@ class BackEnd:
         refusals: candidates that were rejected, and why.
         queries: loops, by their nodes, for which the prior was queried, and the outcome, see `prior_queries`.
         closures: optimizations so far.
-        first_node: of this run's first frame; those before are of the run that saved the map.
+        first_node: this run's first frame; earlier nodes are of the run that saved the map.
         connected_since: node since which consecutive frames are connected; before it the camera was lost.
-        active: submap of the next node, where the camera is; None before it is in the saved map, submap 0.
-        has_one_unit: the inferences of all nodes have one unit, as far as the prior has.
+        active: submap of the next node, where the camera is; None until it is relocalized in the saved map, submap 0.
+        has_one_unit: the inferences of all nodes share one unit, as far as the prior's do.
     """
 
     config: BackEndConfig | None
@@ -148,8 +148,8 @@ def add_node(
 
     Args:
         scale: of its inference.
-        origin: node whose Gaussians it was registered to; None where it was not registered to the map.
-        is_placed: the map holds it: it was registered to it, or the map was made from it.
+        origin: node whose Gaussians it was registered to; None if it was not registered.
+        is_placed: the map holds it: it was registered to the map, or the map was made from it.
     """
     time, pose = len(end.nodes), np.asarray(pose, np.float64)
     known = {"covariance": frame.covariance, "origin": origin, "depth_noise": frame.depth_noise}
@@ -165,7 +165,7 @@ def add_node(
 
 
 def _is_connected(end: BackEnd, row: int) -> bool:
-    """Test whether a node is in the map or has a factor other than loops; False before the camera was found."""
+    """Test whether a node is in the map or has a factor other than loops; False before relocalization."""
     has_factor = any(factor.a == row and not factor.is_loop for factor in end.factors)
     return row >= end.connected_since and (end.nodes[row].is_placed or has_factor)
 

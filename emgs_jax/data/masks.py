@@ -139,8 +139,8 @@ class Masks:
         return lambda row: files[row] and self.fitted(self.decoded(files[row], size, images[row]), size)
 
     def read(self, name: str, size: tuple[int, int]) -> Bool[np.ndarray, "h w"] | None:
-        """What is left out of the image of this name and (width, height) `size`, with the border; as `reader`."""
-        return self.reader([Path(name)], [0], size)(0)
+        """What is left out of the image of this name, without suffix, and (width, height) `size`; as `reader`."""
+        return self.reader([Path(f"{name}.png")], [0], size)(0)
 
     def fingerprint(self) -> list[object]:
         """What the masks depend on: options, and the names and contents of files."""

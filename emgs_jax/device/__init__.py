@@ -1,1 +1,1 @@
-"""Programs and arrays on the device: what is compiled ahead, JAX's settings, and the time that they take."""
+"""Programs and arrays on the device: compilation ahead of use, JAX's settings, and timing."""

@@ -1,4 +1,4 @@
-"""Arrays of NumPy on the device, and poses as both sides have them."""
+"""Move arrays between NumPy and the device, and convert poses."""
 
 from collections.abc import Iterable, Iterator
 from typing import Any
@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 
 def on_device(tree: Any) -> Any:
-    """Leaves of NumPy as arrays of JAX; `jnp.asarray` would make an executable for each of their shapes."""
+    """Convert NumPy leaves to JAX arrays; `jnp.asarray` would compile a program for each shape."""
     return jax.tree.map(jax.device_put, tree)
 
 
@@ -22,7 +22,7 @@ def _poses(matrices: jax.Array, is_finite: jax.Array) -> jaxlie.SE3:
 
 
 def fetched(trees: Iterable[Any]) -> Iterator[Any]:
-    """Trees of arrays on the host, one after the other; the next is being computed while one is looked at."""
+    """Yield trees of arrays on the host; the next one is computed while the caller uses one."""
     pending = None
     for tree in trees:
         if pending is not None:
@@ -33,7 +33,7 @@ def fetched(trees: Iterable[Any]) -> Iterator[Any]:
 
 
 def to_se3(matrices: np.ndarray) -> jaxlie.SE3:
-    """(..., 4, 4) float64 -> poses; a matrix that is not finite gives a pose of NaN, which a step marks as lost."""
+    """Convert (..., 4, 4) float64 to poses; a matrix that is not finite gives NaN, which a step marks as lost."""
     matrices = np.asarray(matrices, np.float64)
     is_finite = np.asarray(np.isfinite(matrices).all(axis=(-2, -1)))
     filled = np.where(is_finite[..., None, None], matrices, np.eye(4)).astype(np.float32)

@@ -1,4 +1,4 @@
-"""Wall-clock time of a run: by phase, and the part that was tracing, lowering and compiling."""
+"""Wall-clock time of a run: by phase, and the part for tracing, lowering and compiling."""
 
 import contextlib
 import sys
@@ -14,10 +14,10 @@ _COMPILING = ("jaxpr_trace_duration", "jaxpr_to_mlir_module_duration", "backend_
 
 
 class Clock:
-    """Wall-clock seconds by phase; while `watching`, also the seconds in which JAX made executables.
+    """Wall-clock seconds by phase; while `watching`, also the seconds of JAX's compilations.
 
     Args:
-        phases: name -> seconds, compilation included; a phase inside another counts for itself only.
+        phases: name -> seconds, including compilation; time of an inner phase does not count in the outer one.
         compile_seconds: union of all spans in which a function was traced, lowered or compiled.
     """
 
@@ -35,7 +35,7 @@ class Clock:
 
     @contextlib.contextmanager
     def phase(self, name: str) -> Iterator[None]:
-        """Count what happens inside as `name`."""
+        """Count the time inside the block as `name`."""
         begin, around, self._inner = time.perf_counter(), self._inner, 0.0
         try:
             yield
@@ -45,7 +45,7 @@ class Clock:
             self._inner = around + seconds
 
     def each(self, name: str, items: Iterable[Item]) -> Iterator[Item]:
-        """Yield the items, and count as `name` what it takes to make each of them."""
+        """Yield the items, and count the time to make each of them as `name`."""
         iterator, end = iter(items), object()
         while True:
             with self.phase(name):
@@ -69,7 +69,7 @@ class Clock:
             self.add_span(end - duration, end)
 
     def add_span(self, begin: float, end: float) -> None:
-        """Count a span that has just ended; functions trace each other, so a span may contain the ones before it."""
+        """Count a span that has just ended; since functions trace each other, it may contain earlier spans."""
         while self._spans and self._spans[-1][0] >= begin:
             inner = self._spans.pop()
             self.compile_seconds -= inner[1] - inner[0]
@@ -79,7 +79,7 @@ class Clock:
 
 
 class Timer:
-    """Seconds since it was made, and what of them was compilation."""
+    """Seconds since it was made, and how many of them were compilation."""
 
     def __init__(self, clock: Clock) -> None:
         self._clock, self._begin, self._compiled = clock, time.perf_counter(), clock.compile_seconds
@@ -90,7 +90,7 @@ class Timer:
 
 
 def peak_memory_mb() -> float | None:
-    """Largest resident size of this process so far in MiB; None where the system does not say."""
+    """Return the peak resident size of this process in MiB; None if the system does not tell."""
     try:
         import resource  # not on Windows
     except ImportError:

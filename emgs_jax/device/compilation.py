@@ -1,4 +1,4 @@
-"""Programs that are compiled side by side before they are needed."""
+"""Compile programs in parallel before they are needed."""
 
 import os
 from collections.abc import Callable, Sequence
@@ -8,10 +8,10 @@ from tqdm import tqdm
 
 
 def compile_all(compilations: Sequence[Callable[[], object]], is_wanted: Callable[[], bool] = lambda: True) -> None:
-    """Call functions that each compile something, on as many cores as there are, with a progress bar.
+    """Call functions that each compile a program, on all cores, with a progress bar.
 
     Args:
-        is_wanted: asked before each; where it is not, the rest is left.
+        is_wanted: called before each; False stops the rest.
     """
     bar = tqdm(total=len(compilations), desc="compiling, once", unit="stage", leave=False, disable=None)
     with ThreadPoolExecutor(os.cpu_count()) as threads, bar:

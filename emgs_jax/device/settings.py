@@ -1,4 +1,4 @@
-"""Settings of JAX: where executables are kept for the next process, and how much of a GPU's memory it takes."""
+"""Settings of JAX: the cache of compiled programs, and its share of a GPU's memory."""
 
 import contextlib
 import math
@@ -11,26 +11,26 @@ from pathlib import Path
 from filelock import FileLock, Timeout
 from omegaconf import DictConfig, OmegaConf
 
-MAX_BYTES = 2 * 2**30  # what was not used for longest goes first
+MAX_BYTES = 2 * 2**30  # the least recently used go first
 HALVES = "-cache", "-atime"  # ends of JAX's file names
-# Where a config says so, and where it has the words that will.
+# Targets of a config that run PyTorch, and words that select them.
 IN_TORCH = re.compile(
     r"emgs_jax\.prior\.network\.|emgs_jax\.features\.dino\.|prior[=:] ?mapanything|features[=:] ?dinov\d_text"
 )
 
 
 def cache_folder() -> Path:
-    """Return the default folder of compiled executables: below XDG_CACHE_HOME or ~/.cache."""
+    """Return the default folder of compiled programs, below XDG_CACHE_HOME or ~/.cache."""
     return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "emgs_jax" / "jax"
 
 
 def use_compilation_cache(folder: str | None = "auto") -> None:
-    """Keep executables in a folder from here on; several processes may share it.
+    """Keep compiled programs in a folder from now on; several processes may share it.
 
     Args:
-        folder: `auto` is `cache_folder()`, but where JAX has been told a folder (JAX_COMPILATION_CACHE_DIR or
-            `jax.config`) that one stays, with its settings; None or `off` keeps nothing that nobody asked for. One that
-            cannot be written to is read, and one line says so.
+        folder: `auto` is `cache_folder()`, unless JAX already has a folder (JAX_COMPILATION_CACHE_DIR or `jax.config`),
+            which stays with its settings. None or `off` sets no folder. A folder that cannot be written to is only
+            read, with a line that says so.
     """
     if folder is None or str(folder) in ("off", "False"):
         return
@@ -46,7 +46,7 @@ def use_compilation_cache(folder: str | None = "auto") -> None:
         with tempfile.TemporaryFile(dir=path) as file:
             file.write(b"is there room?")
         is_kept = True
-    except (OSError, RuntimeError) as error:  # the second: no home
+    except (OSError, RuntimeError) as error:  # RuntimeError: no home
         print(f"warning: nothing is kept of what JAX compiles: {error}", file=sys.stderr)
         if not isinstance(error, OSError) or not os.access(path, os.R_OK | os.X_OK):
             return
@@ -54,17 +54,17 @@ def use_compilation_cache(folder: str | None = "auto") -> None:
     if is_kept:
         _remove_orphans(path)
     jax.config.update("jax_compilation_cache_dir", str(path))
-    # To keep its bound JAX notes when a file was used; where it must not, nothing takes long enough to be kept.
+    # JAX notes when a file was used, to keep its bound. In a read-only folder, no program may count as worth keeping.
     jax.config.update("jax_compilation_cache_max_size", MAX_BYTES if is_kept else -1)
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0 if is_kept else math.inf)
     jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 def _remove_orphans(folder: Path) -> None:
-    """Remove files of JAX's cache that lack their other half, as a full disk leaves them.
+    """Remove files of JAX's cache whose other half is missing, as after a full disk.
 
-    JAX keeps a program in KEY-cache and the time of its last use in KEY-atime. As long as one program has no time, JAX
-    keeps no other (jax 0.10.1).
+    JAX keeps a program in KEY-cache and the time of its last use in KEY-atime. As long as one program lacks its time,
+    JAX stores no other (jax 0.10.1).
     """
     with contextlib.suppress(OSError, Timeout), FileLock(folder / ".lockfile", timeout=10):  # JAX's own lock
         files = {name: {path.name.removesuffix(name) for path in folder.glob(f"*{name}")} for name in HALVES}
@@ -74,16 +74,16 @@ def _remove_orphans(folder: Path) -> None:
 
 
 def leave_memory_to_torch(config: DictConfig) -> None:
-    """Let JAX take the GPU's memory as it needs it where a network runs in PyTorch; else it takes three quarters first.
+    """Let JAX allocate GPU memory as needed if a network runs in PyTorch; by default it takes three quarters at once.
 
-    It has to be called before JAX's first array. A value of XLA_PYTHON_CLIENT_PREALLOCATE that is there stays.
+    Call it before JAX's first array. An existing value of XLA_PYTHON_CLIENT_PREALLOCATE stays.
     """
     if IN_TORCH.search(OmegaConf.to_yaml(config)):
         os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
 
 
 def check_platforms() -> None:
-    """ValueError where JAX_PLATFORMS asks for a device that JAX does not find; it says so without a word of its own."""
+    """Raise a clear ValueError if JAX_PLATFORMS asks for a device that JAX does not find."""
     platforms = os.environ.get("JAX_PLATFORMS", "")
     if platforms in ("", "cpu"):
         return  # without importing JAX, which not all commands need

@@ -1,1 +1,1 @@
-"""What pictures, pages and viewers draw with: colours, layers of a map, splats, the overview."""
+"""Shared by pictures, pages and viewers: colours, layers of a map, splats, the overview."""

@@ -1,4 +1,4 @@
-"""Colours of all that is drawn: statuses of frames, paths, classes; how a picture becomes a file."""
+"""Colours of statuses, paths and classes, and writing of pictures."""
 
 import os
 from typing import NamedTuple
@@ -36,7 +36,7 @@ PATHS = {
     "loops": Look("accepted loops", "#2e86e4", "#63e68b"),
 }
 OURS = PATHS["poses"].paper
-NO_CLASS = "#5a6068"  # of what has no class
+NO_CLASS = "#5a6068"  # of pixels and points without a class
 
 
 def rgb(color: str) -> np.ndarray:
@@ -54,17 +54,17 @@ def class_colors(count: int) -> np.ndarray:
 
 
 def to_bytes(values: np.ndarray) -> np.ndarray:
-    """Convert values in [0, 1] to uint8; what is outside is clipped, nan becomes 0."""
+    """Convert values in [0, 1] to uint8; values outside are clipped, nan becomes 0."""
     return np.rint(255 * np.nan_to_num(values).clip(0.0, 1.0)).astype(np.uint8)
 
 
 def save_png(path: str | os.PathLike, image: np.ndarray) -> None:
-    """Write RGB (h, w, 3) of 8 bits, or numbers (h, w) of 8 or 16 bits, as PNG, whole or not at all."""
+    """Write RGB (h, w, 3) of 8 bits, or numbers (h, w) of 8 or 16 bits, as PNG, atomically."""
     write_file(path, cv2.imencode(".png", image[..., ::-1] if image.ndim == 3 else image)[1].tobytes())
 
 
 def save_figure(path: str | os.PathLike, figure: Figure) -> None:
-    """Write a figure as PNG, whole or not at all; a "$" in its texts is one, as names of files and classes have it."""
+    """Write a figure as PNG, atomically; a "$" in its texts is literal, as in names of files and classes."""
     for text in figure.findobj(Text):
         text.set_parse_math(False)
     with atomic_write(path) as handle:

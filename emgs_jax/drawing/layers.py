@@ -1,4 +1,4 @@
-"""Layers of a map, a few bytes a Gaussian: what the page and the live viewer can show, and how a page holds them."""
+"""Layers of a map that the page and the live viewer can show, at a few bytes a Gaussian, and their packing."""
 
 import base64
 import math
@@ -24,12 +24,12 @@ COV_UNIT = 1e-4  # m²; float16 then holds standard deviations from .1 mm to 2.5
 _LARGEST_HALF = 65504.0
 _similarities, feature_colors = eqx.filter_jit(similarities), eqx.filter_jit(principal_colors)
 _UPPER = np.triu_indices(3)
-# Gaussians as viewers draw them are wide enough along the surface that it has no gaps.
-_NUM_NEIGHBOURS = 6  # as many as touch a disc in a dense packing
-_REACH = 2.0  # standard deviations at which a neighbour may be: opacities of .9 then add up to .9 between them and more
-_CANDIDATES = 18  # nearest means, of which those that face another way are no neighbours
+# Viewers draw Gaussians wide enough along the surface to leave no gaps.
+_NUM_NEIGHBOURS = 6  # the number that touch a disc in a dense packing
+_REACH = 2.0  # standard deviations to a neighbour; in between, opacities of .9 then add up to at least .9
+_CANDIDATES = 18  # nearest means; those that face another way are no neighbours
 _MIN_COSINE = 0.7  # between the normals of neighbours on one surface
-LARGEST = 3.0  # times its width that a Gaussian becomes at most: one that stands alone stays a spot
+LARGEST = 3.0  # largest factor on a Gaussian's width, so that an isolated one stays a spot
 
 
 class Layer(NamedTuple):
@@ -44,7 +44,7 @@ class Layer(NamedTuple):
     scale: str = ""
 
 
-LAYERS = {  # web/layers.js paints them likewise
+LAYERS = {  # web/layers.js colours them in the same way
     "color": Layer("colour", "color"),
     "class": Layer("class", "label"),
     "similarity": Layer("similarity to a class", "similarity", "share"),
@@ -54,11 +54,11 @@ LAYERS = {  # web/layers.js paints them likewise
     "updates": Layer("updates", "updates", "count"),
     "birth": Layer("frame of birth", "birth", "number"),
 }
-ALWAYS = ("color", "normal", "existence", "updates", "birth")  # arrays that every map has
+ALWAYS = ("color", "normal", "existence", "updates", "birth")  # arrays of every map
 
 
 def layers_of(arrays: Collection[str]) -> dict[str, Layer]:
-    """Return the layers that can be shown of these arrays."""
+    """Return the layers that these arrays can show."""
     return {name: layer for name, layer in LAYERS.items() if layer.array in arrays}
 
 
@@ -92,10 +92,10 @@ def packed_covariances(covs: np.ndarray) -> np.ndarray:
 
 
 def closing_covariances(means: np.ndarray, covs: np.ndarray, normals: np.ndarray) -> np.ndarray:
-    """Covariances (n, 3, 3) that close the surface in an ordinary 3DGS rasteriser; for display only, float64.
+    """Compute covariances (n, 3, 3) that close the surface in an ordinary 3DGS rasterizer; for display only, float64.
 
-    Each is widened along its surface until its sixth neighbour lies at `_REACH` standard deviations, measured with its
-    own covariance, so that it keeps its shape; none is narrowed, and the thickness along the unit normal stays.
+    Each is widened along its surface until its sixth neighbour lies at `_REACH` standard deviations of its own
+    covariance, so that it keeps its shape. None is narrowed, and the thickness along the unit normal stays.
     """
     means, covs, normals = (np.asarray(values, np.float64) for values in (means, covs, normals))
     if len(means) < 2:
@@ -111,7 +111,7 @@ def closing_covariances(means: np.ndarray, covs: np.ndarray, normals: np.ndarray
 
 
 def closed(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians with `closing_covariances`; for display only."""
+    """Replace the covariances by `closing_covariances`; for display only."""
     rows = np.flatnonzero(gaussians.valid)
     covs = np.array(gaussians.covs)
     covs[rows] = closing_covariances(*(np.asarray(x)[rows] for x in (gaussians.means, covs, gaussians.normals)))
@@ -124,8 +124,8 @@ def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.nd
     Returns:
         `mean` float32 (n, 3) in metres; `cov` float16 (n, 6), the upper triangle of `closing_covariances` in
         `COV_UNIT`; `color` uint8 (n, 3); `normal` int8 (n, 3), 127 = 1; `existence` uint8, the probability that it
-        stands for something, 255 = 1; `updates` uint16; `birth` int32, the node of its first frame. With text, `label`
-        int16, -1 = none, and `similarity` uint8 (n, c): the cosine with each class, 255 = 1, what is negative is 0.
+        exists, 255 = 1; `updates` uint16; `birth` int32, the node of its first frame. With text, `label`
+        int16, -1 = none, and `similarity` uint8 (n, c): the cosine with each class, 255 = 1, negative ones 0.
     """
     gaussians = jax.device_get(confirmed(map))
     rows = np.flatnonzero(gaussians.valid)
@@ -154,7 +154,7 @@ def map_layers(map: GaussianMap, text: TextEmbeddings | None) -> dict[str, np.nd
 
 
 def feature_layer(map: GaussianMap) -> dict[str, np.ndarray]:
-    """`feature` uint8 (n, 3), the main directions of the features as RGB (`principal_colors`); empty without features.
+    """Return `feature` uint8 (n, 3), the features' principal directions as RGB (`principal_colors`); empty without any.
 
     Rows as in `map_layers`.
     """
@@ -166,7 +166,7 @@ def feature_layer(map: GaussianMap) -> dict[str, np.ndarray]:
 
 
 def thinned(layers: Mapping[str, np.ndarray], weight: np.ndarray, count: int) -> dict[str, np.ndarray]:
-    """Keep the `count` rows of most weight, in their order; all of them where there are no more."""
+    """Keep the `count` rows of largest weight, in their order; all of them if there are no more."""
     keep = np.sort(np.argsort(-weight.astype(np.float64), kind="stable")[:count])
     return {name: values[keep] for name, values in layers.items()}
 
@@ -174,10 +174,10 @@ def thinned(layers: Mapping[str, np.ndarray], weight: np.ndarray, count: int) ->
 def fitted(
     layers: Mapping[str, np.ndarray], paths: Mapping[str, np.ndarray], weight: np.ndarray, limit: int
 ) -> tuple[list[dict[str, Any]], str, int]:
-    """Pack at most `limit` characters, with fewer Gaussians where all of them are too many; the last item is how many.
+    """Pack into at most `limit` characters, with fewer Gaussians if needed; the last item is their number.
 
-    Those of most weight are kept; `paths` stay whole. The paths of some 15,000 frames are too many by themselves: then
-    there is no Gaussian.
+    The Gaussians of largest weight are kept; `paths` stay complete. The paths of some 15,000 frames fill the limit
+    alone, and then no Gaussian is kept.
     """
     count = len(weight)
     about, text = packed({**layers, **paths})
@@ -190,7 +190,7 @@ def fitted(
 def packed(arrays: Mapping[str, np.ndarray]) -> tuple[list[dict[str, Any]], str]:
     """Describe arrays, and pack their bytes: column by column, little-endian, deflated, in base64.
 
-    Columns of one kind, and the first bytes of all numbers before their second ones, deflate to two thirds.
+    Columns of one kind, with the first bytes of all numbers before the second ones, deflate to two thirds.
     """
     about, parts, offset = [], [], 0
     for name, values in arrays.items():

@@ -1,4 +1,4 @@
-"""One picture of a run: the map from above with both paths, and what the map renders beside what the camera saw."""
+"""One picture of a run: the map from above with both paths, and renderings beside camera images."""
 
 import os
 from collections.abc import Mapping, Sequence
@@ -20,10 +20,10 @@ _INK, _PAPER = "#333333", "#e3e6ea"
 
 @dataclass(frozen=True)
 class Paths:
-    """Camera trajectories, (n, 4, 4) T_world_camera each, all in one frame; None where there is no such path."""
+    """Camera trajectories, (n, 4, 4) T_world_camera each, all in one frame; None for a path that does not exist."""
 
     estimate: np.ndarray
-    is_placed: np.ndarray  # (n,), False where the camera was lost and a pose stands in for its own
+    is_placed: np.ndarray  # (n,), False where the camera was lost and its pose is a placeholder
     truth: np.ndarray | None = None  # aligned with the estimate; NaN where unknown
     online: np.ndarray | None = None  # as first estimated, before the back end moved poses
     loops: tuple[tuple[int, int], ...] = ()  # rows of the frames that loop closures join
@@ -71,7 +71,7 @@ def view_from_above(poses: np.ndarray) -> np.ndarray:
     up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else -poses[0, :3, 1]
     centers = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
     flat = centers - np.outer(centers @ up, up)
-    # The longest way of the path runs to the right; a camera at rest looks up the picture.
+    # The path's longest direction points right; a camera at rest looks up the picture.
     direction = np.linalg.svd(flat, full_matrices=True)[2][0] if len(poses) > 2 else poses[0, :3, 0]
     direction = direction if np.abs(flat).max() > 1e-3 else poses[0, :3, 0]
     direction = direction * np.where(direction @ poses[0, :3, 0] < 0, -1.0, 1.0)
@@ -81,21 +81,21 @@ def view_from_above(poses: np.ndarray) -> np.ndarray:
 
 
 def below_ceiling(heights: np.ndarray, camera_heights: np.ndarray) -> np.ndarray:
-    """Mask what may be seen from above: nothing higher than the camera, unless that would hide most of the map."""
+    """Mask what to show from above: nothing higher than the camera, unless that hides most of the map."""
     visible = heights <= camera_heights.max() + 0.1
     return visible if visible.mean() > 0.2 else np.ones_like(visible)
 
 
 def paint_from_above(points: np.ndarray, colors: np.ndarray, cell: float) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Paint points (x, y right and up, z height) into cells [m]; of each cell the highest point is seen.
+    """Paint points (x, y right and up, z height) into cells [m]; each cell shows its highest point.
 
-    Returns RGBA (h, w, 4), transparent where there is no point, and the extent (left, right, bottom, top) in metres.
+    Returns RGBA (h, w, 4), transparent in empty cells, and the extent (left, right, bottom, top) in metres.
     """
     low = np.floor(points[:, :2].min(0) / cell)
     index = (np.floor(points[:, :2] / cell) - low).astype(np.int64)
     width, height = index.max(0) + 1
     image = np.zeros((height, width, 4))
-    order = np.argsort(points[:, 2], kind="stable")  # of repeated indices the last assignment stays
+    order = np.argsort(points[:, 2], kind="stable")  # for repeated indices the last assignment wins
     image[index[order, 1], index[order, 0], :3] = colors[order]
     image[index[order, 1], index[order, 0], 3] = 1.0
     left, bottom = low * cell
@@ -103,7 +103,7 @@ def paint_from_above(points: np.ndarray, colors: np.ndarray, cell: float) -> tup
 
 
 def fill_holes(image: np.ndarray) -> np.ndarray:
-    """Give empty cells of an RGBA picture (h, w, 4) that lie among painted ones their mean colour; twice."""
+    """Fill empty cells of an RGBA picture (h, w, 4) among painted ones with their mean colour; twice."""
     for _ in range(2):
         padded = np.pad(image, ((1, 1), (1, 1), (0, 0)))
         h, w = image.shape[:2]
@@ -116,9 +116,9 @@ def fill_holes(image: np.ndarray) -> np.ndarray:
 def seen_from_above(
     points: np.ndarray, colors: np.ndarray, camera_heights: np.ndarray, cells: tuple[int, int] = (100, 700)
 ) -> tuple[np.ndarray, tuple[float, ...]]:
-    """Paint finite points, at least one (x, y right and up, z height); returns as `paint_from_above` does.
+    """Paint finite points, at least one (x, y right and up, z height); return as `paint_from_above` does.
 
-    What is above the cameras is left out, as are far points. The longer side has as many `cells` as the points fill.
+    Points above the cameras and far points are left out. The longer side of the points has `cells` cells.
     """
     seen = below_ceiling(points[:, 2], camera_heights)
     # Far flying points must not shrink the room to a dot.
@@ -141,7 +141,7 @@ def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
     ):
         if poses is not None:
             _draw_path(axes, poses[:, :3, 3] @ rotation.T, PATHS[name].paper, label, width)
-    # Thinner with its outline than the true path, so that one on top of the other shows both.
+    # Thinner than the true path, outline included, so that both show where they overlap.
     _draw_path(axes, np.where(paths.is_placed[:, None], path, np.nan), OURS, "estimated path", 1.6)
     if paths.loops:
         ends = path[np.array(paths.loops)]
@@ -159,7 +159,7 @@ def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
 
 
 def _paint(axes: Axes, cloud: PointCloud, rotation: np.ndarray, heights: np.ndarray, *cells: tuple[int, int]) -> int:
-    """Paint the finite points of a cloud as `seen_from_above` has them; returns how many these are."""
+    """Paint the finite points of a cloud with `seen_from_above`; return their number."""
     finite = np.isfinite(cloud.points).all(1)
     if finite.any():
         points, colors = rotated(cloud.points[finite], rotation), cloud.colors[finite].clip(0.0, 1.0)
@@ -170,7 +170,7 @@ def _paint(axes: Axes, cloud: PointCloud, rotation: np.ndarray, heights: np.ndar
 
 
 def _draw_path(axes: Axes, path: np.ndarray, color: str, label: str, width: float) -> None:
-    """Draw a line, broken where the path (n, 3) is unknown, with a disc where it begins and a square where it ends."""
+    """Draw a path (n, 3) as a line, broken where unknown, with a disc at the start and a square at the end."""
     outline = [withStroke(linewidth=width + 1.6, foreground="white")]
     axes.plot(path[:, 0], path[:, 1], color=color, linewidth=width, label=label, path_effects=outline)
     known = path[np.isfinite(path).all(1)]
@@ -213,7 +213,7 @@ def _draw_frames(grid: np.ndarray, frames: Sequence[Mapping[str, Any]], unit: st
 
 
 def _draw_labels(column: np.ndarray, frames: Sequence[Mapping[str, Any]], classes: Sequence[str]) -> None:
-    """Draw the classes of some frames, and a legend of those that are seen."""
+    """Draw the classes of some frames, and a legend of visible ones."""
     colors = class_colors(len(classes))
     for axes, frame in zip(column, frames, strict=True):
         labels = np.asarray(frame["labels"])

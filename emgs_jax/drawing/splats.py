@@ -1,4 +1,4 @@
-"""Splats of `emgs polish` as viewers show them: read from splats.ply, packed for a page."""
+"""Splats of `emgs polish` for viewers: read from splats.ply, packed for a page."""
 
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -12,7 +12,7 @@ from emgs_jax.evaluation.clouds import NearestPoints
 from emgs_jax.io.ply import SH_C0
 from emgs_jax.io.ply_reader import read_vertices
 
-_STEPS = 65535  # of a coordinate along the side of the box round all splats
+_STEPS = 65535  # of a coordinate along the side of the box around all splats
 
 
 class Splats(NamedTuple):
@@ -25,7 +25,7 @@ class Splats(NamedTuple):
 
 
 def read_splats(path: Path) -> Splats | None:
-    """Read a 3DGS PLY; None where there is no file, ValueError where it is no such PLY."""
+    """Read a 3DGS PLY; None if there is no file, ValueError if it is no such PLY."""
     if not path.is_file():
         return None
     vertices = read_vertices(path)
@@ -51,18 +51,18 @@ def read_splats(path: Path) -> Splats | None:
 
 
 def owners(splats: np.ndarray, gaussians: np.ndarray) -> np.ndarray:
-    """Find for each splat's mean (n, 3) the row of the nearest Gaussian's (m, 3), whose class and certainty it has."""
+    """Find for each splat's mean (n, 3) the nearest Gaussian (m, 3), whose class and certainty it takes."""
     if len(splats) and not len(gaussians):
         raise ValueError("the map has no Gaussian that splats could belong to: run emgs polish again")
     return NearestPoints(gaussians).query(splats)[1].reshape(len(splats)).astype(np.int32)
 
 
 def splats_for_page(splats: Splats, limit: int) -> tuple[dict[str, Any], str, str, np.ndarray]:
-    """Pack splats into at most `limit` characters, those that cover most if all of them are too many.
+    """Pack splats into at most `limit` characters; if they are too many, those that cover most.
 
     Returns:
-        What the page's program must know (`arrays`, see `fitted`, and the box of the means), the packed arrays, a note
-        on what was left out, and the means of what was not.
+        What the page's program needs (`arrays`, see `fitted`, and the box of the means), the packed arrays, a note on
+        what was left out, and the means of the kept splats.
     """
     low, high = splats.means.min(0), splats.means.max(0)
     step = np.maximum(high - low, 1e-9) / _STEPS

@@ -1,9 +1,9 @@
 """Spatial consistency of loops: which of them imply the same correction of the poses.
 
-Two rooms that are furnished alike look like one place, and all loops between them imply the same correction. The
-correction is wrong as a whole, also between keyframes without a free-space violation, if it brings any keyframes
-together that see through each other's surfaces, as at the end of the hall before the rooms. Without such a view only
-the path is left: that the camera cannot have come back, as far as the path is known.
+Two rooms with the same furniture look like one place, and all loops between them imply the same correction. The whole
+correction is wrong, also between keyframes without a free-space violation, if it brings together any keyframes that see
+through each other's surfaces, as at the end of the hall outside the rooms. Without such a view, only the path can show
+that the camera cannot have returned.
 """
 
 import math
@@ -26,9 +26,9 @@ class ConsistencyConfig:
 
     Args:
         max_query_gap, max_candidate_gap: between the queries and between the candidates of two loops.
-        max_distance: between the positions that they imply for one query.
-        min_others: loops, each of another query, that a loop needs.
-        max_violating_queries: queries of loops with a free-space violation, in a chain of consistent loops.
+        max_distance: between the positions that two loops imply for one query.
+        min_others: consistent loops of other queries that a loop needs.
+        max_violating_queries: allowed queries with a free-space violation in a chain of consistent loops.
     """
 
     max_query_gap: int = number(30, low=0)
@@ -51,15 +51,15 @@ def spatially_consistent(
     Only loops of nearby queries to nearby candidates are compared: the correction of one, T_implied T_now⁻¹, must fit
     the query of the other.
 
-    A false match of repeating texture is alone, or one of many that each imply another correction. Consistent loops
-    form chains, however far the path drifts in the meantime; a chain with too many free-space violations is rejected:
-    see the top of this file.
+    A false match of repeating texture is alone, or one of many that all imply different corrections. Consistent loops
+    form chains, however far the path drifts meanwhile. A chain with too many free-space violations is rejected, see the
+    top of this file.
 
     Args:
         loops: verified ones.
         violating: `VerifyInfo.violation` of loops that were rejected for a free-space violation.
         poses: current T_world_camera of every frame of a loop.
-        log_scales: σ of these: a length of the inference times e^σ is one of the map.
+        log_scales: σ of these frames: a length of the inference times e^σ is one of the map.
     """
     every = [*loops, *violating]
     if not every:
@@ -86,7 +86,7 @@ def spatially_consistent(
 
 
 def pairs_within(frames: Int[np.ndarray, " n"], max_gap: int) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-    """Positions in `frames` of all pairs that lie within a gap of each other, in both orders, each with itself, too."""
+    """Find all pairs of positions in `frames` within a gap of each other, in both orders, also each with itself."""
     order = np.argsort(frames)
     ordered = frames[order]
     begin, end = (

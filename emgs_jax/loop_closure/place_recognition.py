@@ -1,8 +1,8 @@
 """Place recognition: keyframes, and loop candidates among them by the appearance of their images.
 
-RootSIFT (Arandjelović and Zisserman, CVPR 2012) summed up as VLAD (Jégou et al., CVPR 2010), words of the sequence's
-own descriptors. How alike two images of one place are depends on the scene, so a candidate is compared with the
-keyframes just before the query, never with an absolute number.
+RootSIFT (Arandjelović and Zisserman, CVPR 2012) aggregated as VLAD (Jégou et al., CVPR 2010), with words trained on the
+sequence's own descriptors. How similar two images of one place are depends on the scene, so a candidate is compared
+with the keyframes just before the query, never with an absolute threshold.
 """
 
 import math
@@ -16,7 +16,7 @@ from jaxtyping import Bool, Float32, Int, UInt8
 from emgs_jax.keypoints import sift
 from emgs_jax.ops.ranges import number
 
-# A unit descriptor's entries as bytes; few exceed a half, and SIFT itself clips its own at .2.
+# Scale of a unit descriptor's entries as bytes; few exceed a half, and SIFT itself clips its own at .2.
 BYTES_PER_UNIT = 512.0
 
 
@@ -26,13 +26,13 @@ class PlaceRecognitionConfig:
 
     Args:
         num_features: keypoints of one image, at most.
-        max_depth_step: between the depths of the four pixels around a keypoint, relative to the smallest; where it is
-            larger a depth between them would lie on no surface.
-        grid: columns and rows of the depths that are kept.
-        max_training: descriptors that it is trained on; no fewer than words.
+        max_depth_step: between the depths of the four pixels around a keypoint, relative to the smallest; beyond it, an
+            interpolated depth would lie on no surface.
+        grid: columns and rows of the stored depths.
+        max_training: descriptors used for training; no fewer than words.
         min_gap: between the query and a candidate.
-        suppressed_gap: around a candidate, in which a less similar one is left out.
-        num_neighbours: keyframes before the query, whose similarities to it give the threshold.
+        suppressed_gap: around a candidate, within which less similar ones are dropped.
+        num_neighbours: keyframes before the query whose similarities to it give the threshold.
         quantile: of these similarities, which a candidate must reach.
     """
 
@@ -53,12 +53,12 @@ class PlaceRecognitionConfig:
 
 @dataclass(frozen=True)
 class Keyframe:
-    """Description of an image for place recognition; some 95 kB with 500 keypoints and 80 by 60 depths.
+    """Description of an image for place recognition; about 95 kB with 500 keypoints and 80 by 60 depths.
 
     Args:
         pixels: of the keypoints, centres at integers.
         descriptors: RootSIFT as bytes; `unit_descriptors` decodes them.
-        points: of the keypoints in the camera's own frame, units of its own inference; NaN without depth.
+        points: of the keypoints, camera frame, units of its own inference; NaN without depth.
         intrinsics: fx, fy, cx, cy in pixels.
         depths: z at the centres of the cells of a regular grid over the image, units of the inference; 0 without depth.
     """
@@ -74,7 +74,7 @@ class Keyframe:
 
 @dataclass(frozen=True)
 class Database:
-    """Keyframes in the order of time, and a vector for each whose products are cosines.
+    """Keyframes in order of time, each with a vector; products of vectors are cosines.
 
     Args:
         words: the vocabulary (k, 128); empty before the first keypoint.
@@ -95,7 +95,7 @@ def make_keyframe(
     intrinsics: Sequence[float],
     config: PlaceRecognitionConfig,
 ) -> Keyframe:
-    """Make a keyframe of an RGB image and its prediction: camera-frame points, where the mask is on.
+    """Make a keyframe from an RGB image and its prediction: camera-frame points where the mask is on.
 
     Raises:
         ValueError: image, points and mask differ in size.
@@ -106,7 +106,7 @@ def make_keyframe(
         )
     gray = cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
     pixels, descriptors = sift.detect(gray, config.num_features, config.min_contrast)
-    # SIFT may give more than asked for, where the last are equally strong.
+    # SIFT may give more than requested if the last ones are equally strong.
     pixels, descriptors = np.float32(pixels[: config.num_features]), descriptors[: config.num_features]
     as_bytes = np.uint8(np.clip(np.round(BYTES_PER_UNIT * descriptors), 0, 255))
     at_pixels = _interpolated(points, mask, pixels, config.max_depth_step)
@@ -115,7 +115,7 @@ def make_keyframe(
 
 
 def grid_pixels(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.ndarray, " x"], Int[np.ndarray, " y"]]:
-    """The pixels nearest to the centres of a grid's columns and rows over an image of this width and height."""
+    """Find the pixels nearest to the centres of a grid's cells over an image of this width and height."""
     x, y = (np.int64((np.arange(cells) + 0.5) * pixels / cells) for cells, pixels in zip(grid, size, strict=True))
     return x, y
 
@@ -123,7 +123,7 @@ def grid_pixels(size: tuple[int, int], grid: tuple[int, int]) -> tuple[Int[np.nd
 def sampled_depths(
     points: Float32[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"], grid: tuple[int, int]
 ) -> Float32[np.ndarray, "y x"]:
-    """Depth of camera-frame points at the centres of a grid of so many columns and rows; 0 where the mask is off."""
+    """Sample the depth of camera-frame points at the centres of a grid of cells; 0 where the mask is off."""
     x, y = grid_pixels(mask.shape[::-1], grid)
     return np.float32(np.where(mask, points[..., 2], 0.0)[np.ix_(y, x)])
 
@@ -131,7 +131,7 @@ def sampled_depths(
 def _interpolated(
     points: np.ndarray, mask: np.ndarray, pixels: Float32[np.ndarray, "n 2"], max_depth_step: float
 ) -> Float32[np.ndarray, "n 3"]:
-    """Points (h, w, 3) between the four pixels around each keypoint; NaN where one has none or they are apart."""
+    """Interpolate points (h, w, 3) at each keypoint; NaN if one of its four pixels has none or they lie apart."""
     corner = np.clip(np.int64(pixels), 0, np.array(mask.shape)[::-1] - 2)
     x, y = (corner[:, None] + np.array([(0, 0), (1, 0), (0, 1), (1, 1)])).transpose(2, 0, 1)
     around, is_known = np.float64(points[y, x]), mask[y, x].all(axis=1)
@@ -144,13 +144,13 @@ def _interpolated(
 
 
 def unit_descriptors(keyframe: Keyframe) -> Float32[np.ndarray, "n 128"]:
-    """Descriptors of a keyframe, each of length 1 again."""
+    """Decode the descriptors of a keyframe to unit length."""
     descriptors = np.float32(keyframe.descriptors)
     return descriptors / np.maximum(np.linalg.norm(descriptors, axis=1, keepdims=True), 1.0)
 
 
 def add_keyframe(database: Database, keyframe: Keyframe, config: PlaceRecognitionConfig) -> Database:
-    """Add a keyframe to the database; the words are trained anew whenever the number of keyframes has doubled.
+    """Add a keyframe to the database; words are retrained whenever the number of keyframes has doubled.
 
     Raises:
         ValueError: the keyframe is not later than the last.
@@ -165,7 +165,7 @@ def add_keyframe(database: Database, keyframe: Keyframe, config: PlaceRecognitio
 
 
 def train_database(keyframes: Sequence[Keyframe], config: PlaceRecognitionConfig) -> Database:
-    """Make the database of keyframes, in their order, with words of all of them."""
+    """Make a database of keyframes, in their order, with words trained on all of them."""
     descriptors = np.concatenate([unit_descriptors(one) for one in keyframes])
     sizes = config.num_words, config.max_training, config.num_iterations
     words = train_words(descriptors, sizes, config.seed)
@@ -176,10 +176,10 @@ def train_database(keyframes: Sequence[Keyframe], config: PlaceRecognitionConfig
 def train_words(
     descriptors: Float32[np.ndarray, "n d"], sizes: tuple[int, int, int], seed: int
 ) -> Float32[np.ndarray, "k d"]:
-    """Train words, the centres of k-means over evenly chosen descriptors; none with fewer descriptors than words.
+    """Train words, the centres of k-means over evenly chosen descriptors; none if descriptors are fewer than words.
 
     Args:
-        sizes: number of words, of descriptors at most, and of iterations.
+        sizes: number of words, maximal number of descriptors, number of iterations.
     """
     num_words, max_training, num_iterations = sizes
     if len(descriptors) < num_words:
@@ -192,10 +192,10 @@ def train_words(
 
 
 def vlad(descriptors: Float32[np.ndarray, "n 128"], words: Float32[np.ndarray, "k 128"]) -> Float32[np.ndarray, " v"]:
-    """VLAD: for each word the sum of what its descriptors differ from it by, one unit vector; 0 without descriptors.
+    """Compute VLAD: for each word the sum of its descriptors' differences from it, as one unit vector; 0 without any.
 
-    Every word's part is made as long as any other's before the signed root: what repeats in the image must not outweigh
-    the rest (Arandjelović and Zisserman, CVPR 2013).
+    Each word's part is normalised before the signed root, so that repeated texture does not outweigh the rest
+    (Arandjelović and Zisserman, CVPR 2013).
     """
     parts = np.zeros_like(words)
     if len(words):
@@ -210,10 +210,10 @@ def _unit(vectors: Float32[np.ndarray, "*b d"]) -> Float32[np.ndarray, "*b d"]:
 
 
 def propose_candidates(database: Database, row: int, config: PlaceRecognitionConfig) -> list[int]:
-    """Propose loop candidates (rows): earlier keyframes as similar as the last neighbours or more, best first.
+    """Propose loop candidates (rows): earlier keyframes at least as similar as the query's neighbours, best first.
 
-    At least `min_gap` frames older, the best only within `suppressed_gap` frames, `num_candidates` at most; none for
-    the first keyframe. The threshold is a quantile of the similarity to neighbours (LoopSplat, ViSTA-SLAM).
+    They are at least `min_gap` frames older. Within `suppressed_gap` frames only the best counts, and there are at most
+    `num_candidates`. The threshold is a quantile of the similarity to neighbours (LoopSplat, ViSTA-SLAM).
     """
     similarity = database.vectors[: row + 1] @ database.vectors[row]
     neighbours = similarity[max(row - config.num_neighbours, 0) : row]
@@ -221,7 +221,7 @@ def propose_candidates(database: Database, row: int, config: PlaceRecognitionCon
         return []
     frames = np.array([keyframe.frame for keyframe in database.keyframes[: row + 1]])
     is_old = frames <= frames[row] - max(config.min_gap, 1)
-    # An image without keypoints is like none, itself included.
+    # An image without keypoints is similar to none, not even itself.
     is_alike = (similarity >= np.quantile(neighbours, config.quantile)) & (similarity > 0)
     return _apart(similarity, frames, is_old & is_alike, config.num_candidates, config.suppressed_gap)
 
@@ -229,9 +229,9 @@ def propose_candidates(database: Database, row: int, config: PlaceRecognitionCon
 def most_similar(
     database: Database, query: Keyframe, rows: Sequence[int], count: int, config: PlaceRecognitionConfig
 ) -> list[int]:
-    """Find the keyframes (rows) most similar to one without a known time, the best only within `suppressed_gap` frames.
+    """Find the keyframes (rows) most similar to a query without a known time, one within each `suppressed_gap` frames.
 
-    There is no threshold of the similarity: that of `propose_candidates` comes from the query's neighbours in time.
+    There is no threshold, because that of `propose_candidates` comes from the query's neighbours in time.
     """
     similarity = database.vectors @ vlad(unit_descriptors(query), database.words)
     frames = np.array([keyframe.frame for keyframe in database.keyframes])
@@ -247,7 +247,7 @@ def _apart(
     count: int,
     gap: int,
 ) -> list[int]:
-    """The most similar of the allowed rows, `count` at most, each more than `gap` frames from the better ones."""
+    """Choose the most similar allowed rows, at most `count`, each more than `gap` frames from better ones."""
     chosen: list[int] = []
     for row in np.argsort(-similarity, kind="stable"):
         apart = [abs(frames[row] - frames[one]) > gap for one in chosen]

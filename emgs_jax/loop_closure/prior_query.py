@@ -1,8 +1,8 @@
 """Second measurement of a loop: one prediction of the prior with views of both visits.
 
-A feed-forward model predicts relative poses of images however far apart in time they were taken, without the path
-between them. Keypoints have found the loop; the prediction is an independent measurement of it, which confirms it or
-rejects it.
+A feed-forward model predicts relative poses of images without knowing the path between them, however far apart in time
+they were taken. Keypoints have found the loop; the prediction is an independent measurement, which confirms or rejects
+it.
 """
 
 import math
@@ -22,17 +22,18 @@ from emgs_jax.ops.ranges import number
 
 @dataclass(frozen=True)
 class PriorQueryConfig:
-    """Second measurement of loops by the prior: whether it is made, on which views, and its standard deviations.
+    """Second measurement of loops by the prior: whether to make it, from which views, and its standard deviations.
 
     Args:
-        is_used: measure loops that violate the poses in this way, too, where the prior can predict both visits.
-        max_queries: loops of a closure that are measured, each of another query, those with most inliers.
-        spacing: frames between the two visits' frames and the neighbouring ones that the prior sees as well.
-        std, std_share: of each axis of the pose between the two visits: in units of the earlier one, and of its length.
-        std_deg: of its rotation, about each axis.
-        log_ratio_std: of the ratio of the units of the two inferences that the loop is between.
-        min_cells: of the grid of depths that an image of either must have in common with its own inference.
-        max_misfit: χ² of the two measurements of a loop, of seven degrees of freedom, beyond which it is refused.
+        is_used: measure loops that violate the poses in this way, too, if the prior can predict both visits.
+        max_queries: how many loops of a closure are measured: those with most inliers, each of another query.
+        spacing: frames between either visit's frame and the neighbouring frames that the prior also sees.
+        std, std_share: per axis of the translation between the visits: in units of the earlier one, and as a share of
+            its length.
+        std_deg: of the rotation, about each axis.
+        log_ratio_std: of the log-ratio of the units of the loop's two inferences.
+        min_cells: cells of the depth grid that each image must share with its own inference.
+        max_misfit: χ² (seven degrees of freedom) between the two measurements of a loop beyond which it is refused.
     """
 
     is_used: bool = True
@@ -48,11 +49,11 @@ class PriorQueryConfig:
 
 @dataclass(frozen=True)
 class JointPrediction:
-    """Prediction of one inference that shows both visits of a place, in its own unit.
+    """Prediction of one inference that sees both visits of a place, in its own unit.
 
     Args:
-        T_a_b: camera b -> camera a; not finite where it is not predicted.
-        points: of a and of b, each in its own camera's frame.
+        T_a_b: camera b -> camera a; not finite if it is not predicted.
+        points: of a and of b, each in its own camera frame.
     """
 
     T_a_b: Float[np.ndarray, "4 4"]
@@ -64,13 +65,13 @@ PriorQuery = Callable[[int, int], JointPrediction | None]  # of two frames, the 
 
 
 def measure_by_prior(joint: JointPrediction, a: Keyframe, b: Keyframe, config: PriorQueryConfig) -> Similarity | None:
-    """Measure the similarity between two keyframes' inferences by an inference that shows both visits.
+    """Measure the similarity between two keyframes' inferences by an inference that sees both visits.
 
-    Its unit is neither's: the depths of a and b stand in both, e^{ρ_x} = median z'_x / z_x. So t = e^{-ρ_a} t', and the
-    ratio of a's unit to b's is ρ_b - ρ_a.
+    It has a unit of its own, which the depths of a and b relate to theirs: e^{ρ_x} = median z'_x / z_x. So
+    t = e^{-ρ_a} t', and the log-ratio of a's unit to b's is ρ_b - ρ_a.
 
     Returns:
-        The similarity in units of a, its covariance diagonal; None where the inference has no pose, or too few depths.
+        The similarity in units of a, with a diagonal covariance; None if the inference has no pose or too few depths.
     """
     if not np.isfinite(joint.T_a_b).all():
         return None
@@ -88,7 +89,7 @@ def measure_by_prior(joint: JointPrediction, a: Keyframe, b: Keyframe, config: P
 
 
 def fuse_measurements(loop: LoopMeasurement, other: Similarity) -> tuple[LoopMeasurement, float]:
-    """Fuse two measurements of a loop, weighted by their information; return also χ² of their difference.
+    """Fuse two measurements of a loop, weighted by their information; also return χ² of their difference.
 
     With e = Log(Z⁻¹ Z') to first order, Λ = WᵀW + Σ'⁻¹ and ξ = Λ⁻¹ Σ'⁻¹ e the loop is at Z Exp(ξ), and
     χ² = eᵀ (Σ + Σ')⁻¹ e.

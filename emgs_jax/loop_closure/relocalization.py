@@ -1,7 +1,7 @@
-"""Relocalization: the pose of a camera among keyframes with known poses, for one that is lost or new in a saved map.
+"""Relocalization: find the pose of a camera that is lost, or new in a saved map, among keyframes with known poses.
 
-Nothing is known of the pose, so every keyframe of similar appearance is a candidate. Each is verified by itself; the
-best one gives the pose, unless another verified candidate implies a different one.
+Since nothing is known about the pose, every keyframe of similar appearance is a candidate. Each is verified on its own.
+The best one gives the pose, unless another verified candidate implies a different one.
 """
 
 import math
@@ -25,15 +25,15 @@ class RelocalizationConfig:
     """Settings of relocalization: when it is attempted, and when its result is accepted.
 
     Args:
-        patience: frames in a row that are not tracked, from which on relocalization is attempted.
-        max_patience: likewise, from which on the map restarts at the pose that the prior predicts, if relocalization
+        patience: untracked frames in a row after which relocalization is attempted.
+        max_patience: likewise, after which the map restarts at the pose that the prior predicts, if relocalization
             still fails. inf: never.
-        num_candidates: keyframes that are verified, each of another time span.
-        max_distance: between the positions that two candidates imply, times the distance of the points that the camera
-            sees.
+        num_candidates: keyframes to verify, each from another time span.
+        max_distance: between the positions that two candidates imply, as a fraction of the distance of the points that
+            the camera sees.
         min_inliers: of the best candidate.
         min_inlier_fraction: of the points that fit the map when the pose is refined in it.
-        max_step: between the pose by the keyframe and that by the map, times the mean depth.
+        max_step: between the pose by the keyframe and that by the map, as a fraction of the mean depth.
     """
 
     patience: int = number(3, low=1)
@@ -64,7 +64,7 @@ class PosedKeyframes:
 
 @dataclass(frozen=True)
 class RelocalizedPose:
-    """Pose of a camera as found by relocalization.
+    """Pose of a camera, found by relocalization.
 
     Args:
         log_scale: σ of its inference.

@@ -1,4 +1,4 @@
-"""Relative pose of two keyframes that show the same place, with gates on the pair itself, cheap ones first."""
+"""Relative pose of two keyframes of one place, with gates on the pair, cheap ones first."""
 
 import math
 from dataclasses import dataclass, field
@@ -52,16 +52,17 @@ class AlignmentConfig:
     Args:
         max_ratio: distance to the best descriptor over that to the second.
         max_epipolar_error: of a match that fits the essential matrix.
-        min_matches: that fit it.
+        min_matches: number of matches that fit it.
         max_reprojection_error: of a point that fits a pose.
-        min_pose_points: that fit, in either direction.
-        max_pose_gap: between the poses of the two directions, times the median depth.
-        max_pose_turn_deg: between these.
-        min_hull: of the points in either image, share of its area.
-        min_flatness: second standard deviation of the points over the first: 0 on a line.
+        min_pose_points: number of points that fit, in either direction.
+        max_pose_gap: distance between the poses of the two directions, as a fraction of the median depth.
+        max_pose_turn_deg: angle between them.
+        min_hull: area of the points' convex hull in either image, as a share of the image.
+        min_flatness: ratio of the second to the first standard deviation of the points; 0 on a line.
         min_extent: between the 5 % and the 95 % quantile along one of the axes.
         max_depth_scatter: standard deviation of the points' log depth ratio (from the MAD).
-        scale_std: of the prior's log-scale; the ratio of two may be 3 √2 times that. Infinite without a metric prior.
+        scale_std: of the prior's log-scale; the log-ratio of two may be 3 √2 times that. Infinite unless the prior is
+            metric.
     """
 
     max_ratio: float = number(0.85, low=0, high=1)
@@ -81,7 +82,7 @@ class AlignmentConfig:
 
 
 class RefusedError(Exception):
-    """A gate is not passed.
+    """A keyframe pair fails a gate.
 
     Args:
         measured: what the gate compares with its threshold.
@@ -94,12 +95,12 @@ class RefusedError(Exception):
 
 @dataclass(frozen=True)
 class Aligned:
-    """Two keyframes that show the same.
+    """Two keyframes of the same place.
 
     Args:
         similarity: of camera b in the frame of a.
-        num_inliers: points that fit in every direction in which they have a depth.
-        median_depth: of these, in a's units.
+        num_inliers: points that fit in every direction for which they have a depth.
+        median_depth: of these points, in a's units.
     """
 
     similarity: Similarity
@@ -108,18 +109,18 @@ class Aligned:
 
 
 def require(gate: Gate, passes: bool, measured: float) -> None:
-    """Raise RefusedError where a gate is not passed."""
+    """Raise RefusedError if a gate is not passed."""
     if not passes:
         raise RefusedError(gate, measured)
 
 
 def align(a: Keyframe, b: Keyframe, config: AlignmentConfig) -> Aligned:
-    """The similarity between two keyframes; raises RefusedError where they may not show the same."""
+    """Compute the similarity between two keyframes; raise RefusedError if they may not show the same place."""
     pairs = _matched(a, b, config)
     T_a_b, by_points_of_a = _posed(pairs.points_a, pairs.pixels_b, pairs.K_b, config)
     T_b_a, by_points_of_b = _posed(pairs.points_b, pairs.pixels_a, pairs.K_a, config)
     in_a, in_b = np.isfinite(pairs.points_a[:, 2]), np.isfinite(pairs.points_b[:, 2])
-    # A point that fits in one direction only has a wrong depth in the other.
+    # A point that fits in only one direction has a wrong depth in the other.
     fits = (by_points_of_a | ~in_a) & (by_points_of_b | ~in_b) & (in_a | in_b)
     both = pairs.rows(fits & in_a & in_b)
     require(Gate.POSE, len(both.pixels_a) >= MIN_POSE, len(both.pixels_a))
@@ -133,14 +134,14 @@ def align(a: Keyframe, b: Keyframe, config: AlignmentConfig) -> Aligned:
 
 
 def _matched(a: Keyframe, b: Keyframe, config: AlignmentConfig) -> Pairs:
-    """Mutual matches that fit one essential matrix."""
+    """Find mutual matches that fit one essential matrix."""
     rows_a, rows_b = mutual(unit_descriptors(a), unit_descriptors(b), config.max_ratio)
     require(Gate.MATCHES, len(rows_a) >= config.min_matches, len(rows_a))
     pairs = Pairs(
         *(np.float64(array) for array in (a.pixels[rows_a], b.pixels[rows_b], a.points[rows_a], b.points[rows_b])),
         *(calibration(keyframe.intrinsics) for keyframe in (a, b)),
     )
-    # In the pixels of one camera: the essential matrix is of two that are alike.
+    # In pixels of one camera, because the essential matrix assumes two equal cameras.
     as_a = (pairs.pixels_b - pairs.K_b[:2, 2]) / pairs.K_b.diagonal()[:2] * pairs.K_a.diagonal()[:2] + pairs.K_a[:2, 2]
     _, mask = essential(pairs.pixels_a, as_a, pairs.K_a, config.max_epipolar_error)
     inliers = np.zeros(len(rows_a), bool) if mask is None else mask.ravel() > 0
@@ -152,7 +153,7 @@ def _matched(a: Keyframe, b: Keyframe, config: AlignmentConfig) -> Pairs:
 def _posed(
     points: Float[np.ndarray, "n 3"], pixels: Float[np.ndarray, "n 2"], K: np.ndarray, config: AlignmentConfig
 ) -> tuple[Float[np.ndarray, "4 4"], Bool[np.ndarray, " n"]]:
-    """T_points_camera of the camera that sees the points at the pixels, and which of them (n,) fit."""
+    """Solve for T_points_camera of a camera that sees points at pixels, and find which (n,) fit."""
     known = np.flatnonzero(np.isfinite(points[:, 2]))
     found = pose_of(points[known], pixels[known], K, MIN_POSE, config.max_reprojection_error)
     count = 0 if found is None else len(found[1])
@@ -164,7 +165,7 @@ def _posed(
 
 
 def _depths(T_a_b: Float[np.ndarray, "4 4"], points_a: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, " n"]:
-    """Of points of frame a, seen by camera b."""
+    """Compute depths in camera b of points in frame a."""
     return (points_a - T_a_b[:3, 3]) @ T_a_b[:3, 2]
 
 
@@ -181,7 +182,7 @@ def _check_spread(
     size_b: tuple[int, int],
     config: AlignmentConfig,
 ) -> None:
-    """Points that are close together, or on a line, leave the pose open."""
+    """Refuse points that are close together or on a line, which do not determine the pose."""
     share = min(_hull_share(pairs.pixels_a, size_a), _hull_share(pairs.pixels_b, size_b))
     require(Gate.HULL, share >= config.min_hull, share)
     centred = points - points.mean(axis=0)
@@ -193,7 +194,7 @@ def _check_spread(
 
 
 def _hull_share(pixels: Float[np.ndarray, "n 2"], size: tuple[int, int]) -> float:
-    """Area of the convex hull over that of the image."""
+    """Compute the area of the pixels' convex hull as a share of the image."""
     return cv2.contourArea(cv2.convexHull(np.float32(pixels))) / (size[0] * size[1])
 
 

@@ -1,7 +1,7 @@
 """The similarity between the cameras of two keyframes that show the same points, by robust least squares.
 
-Each camera has predicted the points in its own frame and units: X_a = e^r R X_b + t. All four say something: the points
-of either seen by the other (pixels), and the two depths of one point (r, and the distance).
+Each camera has predicted the points in its own frame and units: X_a = e^r R X_b + t. The residuals are reprojections of
+either camera's points in the other (pixels), and the two depths of each point (which measure r and the distance).
 """
 
 from dataclasses import dataclass
@@ -17,19 +17,19 @@ from emgs_jax.geometry import transform_points
 from emgs_jax.ops.constants import MAD_TO_STD
 from emgs_jax.ops.ranges import number
 
-HUBER = 1.345  # standard deviations: 95 % efficient where all is normal
+HUBER = 1.345  # standard deviations: 95 % efficient for normal errors
 
 
 @dataclass(frozen=True)
 class RefineConfig:
-    """Noise model of the two-view refinement: least residuals, their correlation, and least errors of the result.
+    """Noise model of the two-view refinement: smallest residuals, their correlation, and smallest errors of the result.
 
     Args:
         min_pixel_std, min_depth_std: of residuals in pixels and log depth, at least.
-        correlation: between the residuals of any two points: errors of a predicted depth are smooth, so n points count
-            as n / (1 + (n - 1) correlation).
-        floor_translation, floor_rotation_deg, floor_log_ratio: standard deviations that all results have besides, in
-            units of a, degrees, and of the log-ratio.
+        correlation: between the residuals of any two points, as depth errors are smooth: n points count as
+            n / (1 + (n - 1) correlation).
+        floor_translation, floor_rotation_deg, floor_log_ratio: standard deviations added to all results, in units of a,
+            degrees, and of the log-ratio.
     """
 
     min_pixel_std: float = number(0.3, low=1e-6, high=1000)
@@ -42,10 +42,10 @@ class RefineConfig:
 
 @dataclass(frozen=True)
 class Pairs:
-    """The same points in two keyframes, row by row: where each shows them and where each takes them to be.
+    """The same points in two keyframes, row by row: their pixels and their predicted positions in both.
 
     Args:
-        points_a, points_b: in either camera's frame and units; NaN without depth.
+        points_a, points_b: each in its own camera frame and units; NaN without depth.
     """
 
     pixels_a: Float[np.ndarray, "n 2"]
@@ -56,19 +56,19 @@ class Pairs:
     K_b: Float[np.ndarray, "3 3"]
 
     def rows(self, chosen: np.ndarray) -> "Pairs":
-        """Some of the points."""
+        """Select some of the points."""
         arrays = (self.pixels_a, self.pixels_b, self.points_a, self.points_b)
         return Pairs(*(array[chosen] for array in arrays), self.K_a, self.K_b)
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """X_a = e^r R X_b + t, and how well it is known.
+    """The similarity X_a = e^r R X_b + t and its covariance.
 
     Args:
         T_a_b: R and t; camera b -> camera a, in a's units.
-        log_ratio: r, log of a's unit over b's: what a's inference gives as e^r, b's gives as 1.
-        covariance: of (translation, rotation, r) where the truth is T_a_b Exp(·) and r + ·.
+        log_ratio: r, log-ratio of lengths: one that is e^r in a's inference is 1 in b's.
+        covariance: of (translation, rotation, r), if the truth is T_a_b Exp(·) and r + ·.
     """
 
     T_a_b: Float[np.ndarray, "4 4"]
@@ -77,9 +77,9 @@ class Similarity:
 
 
 def log_ratios(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float) -> Float[np.ndarray, "n"]:
-    """log of a's depth over b's of each point, the mean of what it is seen from b and from a; NaN where one has none.
+    """Compute each point's log-ratio of a's depth to b's, averaged over both views; NaN if one has no depth.
 
-    `log_ratio` only brings b's points into a's units where they are seen from a.
+    `log_ratio` only brings b's points into a's units when they are viewed from a.
     """
     from_b = transform_points(np.linalg.inv(T_a_b), pairs.points_a)[:, 2] / pairs.points_b[:, 2]
     from_a = pairs.points_a[:, 2] / transform_points(T_a_b, np.exp(log_ratio) * pairs.points_b)[:, 2]
@@ -88,10 +88,10 @@ def log_ratios(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float) 
 
 
 def refine(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float, config: RefineConfig) -> Similarity:
-    """The similarity that fits best from one nearby, Huber's loss.
+    """Refine a similarity from a nearby start, with Huber's loss.
 
-    Residuals are weighted by their own scatter, pixels and depths each: a first round measures it. The covariance is
-    (JᵀJ)⁻¹ (1 + (n - 1) correlation) and the floors.
+    Residuals are weighted by their own scatter, separately for pixels and depths; a first round measures it. The
+    covariance is (JᵀJ)⁻¹ (1 + (n - 1) correlation) plus the floors.
     """
     stds = np.array([config.min_pixel_std, config.min_depth_std])
     floors = np.repeat([config.floor_translation, np.radians(config.floor_rotation_deg)], 3)
@@ -102,7 +102,7 @@ def refine(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float, conf
         def weighted(step, start=(T_a_b, log_ratio), std=stds[kinds]):
             return _errors(pairs, *perturbed(*start, step)) / std
 
-        with _libraries().limit(limits=1, user_api="blas"):  # for seven unknowns threads cost more than they do
+        with _libraries().limit(limits=1, user_api="blas"):  # for seven unknowns, threads cost more than they gain
             found = least_squares(weighted, np.zeros(7), loss="huber", f_scale=HUBER, x_scale="jac")
         T_a_b, log_ratio = perturbed(T_a_b, log_ratio, found.x)
         errors = np.abs(_errors(pairs, T_a_b, log_ratio))
@@ -115,14 +115,14 @@ def refine(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float, conf
 
 @cache
 def _libraries() -> ThreadpoolController:
-    """The libraries with threads that this process has loaded, BLAS among them."""
+    """Find the multithreaded libraries that this process has loaded, such as BLAS."""
     return ThreadpoolController()
 
 
 def perturbed(
     T_a_b: Float[np.ndarray, "4 4"], log_ratio: float, step: Float[np.ndarray, "7"]
 ) -> tuple[Float[np.ndarray, "4 4"], float]:
-    """T (I + step) to first order, its rotation exact: the order and side of `jaxlie`'s tangents."""
+    """Apply T (I + step) to first order, with an exact rotation; order and side as in `jaxlie`."""
     T_step = np.eye(4)
     T_step[:3, :3], T_step[:3, 3] = Rotation.from_rotvec(step[3:6]).as_matrix(), step[:3]
     return T_a_b @ T_step, log_ratio + step[6]
@@ -133,13 +133,13 @@ def _has_points(pairs: Pairs) -> tuple[Bool[np.ndarray, "n"], Bool[np.ndarray, "
 
 
 def _kinds(pairs: Pairs) -> np.ndarray:
-    """Of each of `_errors`: 0 pixels, 1 log depth."""
+    """Tell the kind of each of `_errors`: 0 pixels, 1 log depth."""
     in_a, in_b = _has_points(pairs)
     return np.repeat([0, 1], [2 * in_a.sum() + 2 * in_b.sum(), (in_a & in_b).sum()])
 
 
 def _errors(pairs: Pairs, T_a_b: Float[np.ndarray, "4 4"], log_ratio: float) -> Float[np.ndarray, " r"]:
-    """In pixels of b, then of a, of the points that the other has; then in log depth where both have one."""
+    """Compute residuals: pixels of b and of a, for the other's points; then log depth of points that both have."""
     in_a, in_b = _has_points(pairs)
     seen_by_b = transform_points(np.linalg.inv(T_a_b), pairs.points_a[in_a])
     seen_by_a = transform_points(T_a_b, np.exp(log_ratio) * pairs.points_b[in_b])

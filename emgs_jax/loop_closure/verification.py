@@ -1,6 +1,6 @@
-"""Verification of loop candidates: the two keyframes show the same, neighbours confirm it, no free space is violated.
+"""Verification of loop candidates: both keyframes show one place, neighbours confirm it, no free space is violated.
 
-A loop that passes all gates may still be wrong: two rooms that are furnished alike look like one place. Spatial
+A loop that passes all gates may still be wrong: two rooms with the same furniture look like one place. Spatial
 consistency tells them apart, see `consistency`.
 """
 
@@ -25,11 +25,12 @@ class VerificationConfig:
 
     Args:
         alignment: of query and candidate, and of query and each neighbour.
-        min_neighbours: of the candidate that must be verified too.
-        max_neighbour_gap, max_neighbour_distance: the camera may be elsewhere by this times the median depth plus this.
-        max_neighbour_turn_deg: between the poses by way of candidate and neighbour.
-        max_free_space_violation: share of the surface that both show that is in free space of the other.
-        free_space_margin: share of the depth by which it must be in the way.
+        min_neighbours: neighbours of the candidate that must be verified, too.
+        max_neighbour_gap, max_neighbour_distance: candidate and neighbour may place the camera apart by the first times
+            the median depth, plus the second.
+        max_neighbour_turn_deg: angle between these two poses.
+        max_free_space_violation: share of the commonly visible surface that lies in free space of the other camera.
+        free_space_margin: fraction of the depth by which it must be in front.
     """
 
     alignment: AlignmentConfig = field(default_factory=AlignmentConfig)
@@ -43,11 +44,12 @@ class VerificationConfig:
 
 @dataclass(frozen=True)
 class Neighbour:
-    """A keyframe near a candidate, and where it is known to be.
+    """A keyframe near a candidate, with its known relative pose.
 
     Args:
         T_candidate_neighbour: camera neighbour -> camera candidate, in units of the candidate's inference.
-        log_ratio: σ_neighbour - σ_candidate, where a length of an inference times e^σ is metric; 0 where both are.
+        log_ratio: σ_neighbour - σ_candidate, where a length of an inference times e^σ is one of the map; 0 if both are
+            metric.
     """
 
     keyframe: Keyframe
@@ -62,10 +64,10 @@ class LoopMeasurement:
     Args:
         a, b: their frames.
         Z_a_b: camera b -> camera a, in units of a's inference.
-        log_ratio: σ_b - σ_a: log of the median ratio of a point's depth in a's inference over that in b's.
-        sqrt_info: W, upper triangular, with WᵀW the information of (translation, rotation, log-ratio) where the truth
-            is Z Exp(·).
-        num_inliers: points that fit in every direction in which they have a depth.
+        log_ratio: σ_b - σ_a: log of the median ratio of a point's depth in a's inference to that in b's.
+        sqrt_info: W, upper triangular, with WᵀW the information on (translation, rotation, log-ratio), if the truth is
+            Z Exp(·).
+        num_inliers: points that fit in every direction for which they have a depth.
     """
 
     a: int
@@ -81,8 +83,8 @@ class VerifyInfo:
     """Why a candidate was refused.
 
     Args:
-        refused_by: the first gate that it did not pass; None if accepted.
-        measured: what that gate compares with its threshold; NaN if accepted.
+        refused_by: the first gate that failed; None if accepted.
+        measured: the value that this gate compares with its threshold; NaN if accepted.
         violation: the measurement of a loop whose matches fit but which violates free space: evidence against all
             loops that imply the same correction.
     """
@@ -95,7 +97,7 @@ class VerifyInfo:
 def verify(
     query: Keyframe, candidate: Keyframe, neighbours: Sequence[Neighbour], config: VerificationConfig
 ) -> tuple[LoopMeasurement | None, VerifyInfo]:
-    """Measure where the query's camera is from the candidate's; None with the reason where it is not sure to be there.
+    """Measure the query's camera relative to the candidate's; None, with the reason, if this is not certain.
 
     Args:
         neighbours: keyframes just before and after the candidate, with known poses relative to it.
@@ -132,7 +134,7 @@ def neighbours_of(
 def _check_neighbours(
     found: Aligned, query: Keyframe, neighbours: Sequence[Neighbour], config: VerificationConfig
 ) -> None:
-    """Every neighbour that is verified alone must put the query where the candidate does; enough of them must be."""
+    """Check that enough neighbours are verified, and that each of these places the query where the candidate does."""
     verified = 0
     for neighbour in neighbours:
         try:
@@ -149,11 +151,11 @@ def _check_neighbours(
 
 
 def free_space_violation(a: Keyframe, b: Keyframe, similarity: Similarity, margin: float) -> float:
-    """Return the share of the surface seen by both cameras that lies in free space of the other; the larger of the two.
+    """Return the share of commonly visible surface that lies in free space of the other camera; the larger of both.
 
     Args:
         similarity: of camera b in the frame of a.
-        margin: share of the depth by which it must be nearer than all that the other sees around it.
+        margin: fraction of the depth by which it must be nearer than everything that the other sees around it.
     """
     points_b = np.exp(similarity.log_ratio) * _points(b)
     T_b_a = np.linalg.inv(similarity.T_a_b)
@@ -165,7 +167,7 @@ def free_space_violation(a: Keyframe, b: Keyframe, similarity: Similarity, margi
 
 
 def _points(keyframe: Keyframe) -> Float[np.ndarray, "n 3"]:
-    """Camera-frame points of the keyframe's depth grid, where it has a depth."""
+    """Back-project the keyframe's depth grid to camera-frame points, where it has a depth."""
     fx, fy, cx, cy = keyframe.intrinsics
     x, y = np.meshgrid(*grid_pixels(keyframe.size, keyframe.depths.shape[::-1]))
     z = np.float64(keyframe.depths)
@@ -173,14 +175,14 @@ def _points(keyframe: Keyframe) -> Float[np.ndarray, "n 3"]:
 
 
 def _share(points: Float[np.ndarray, "n 3"], keyframe: Keyframe, margin: float) -> float:
-    """Return the share of points in a keyframe's image that lie in front of its surface; 0 where it sees none."""
+    """Return the share of points in a keyframe's image that lie in front of its surface; 0 if it sees none."""
     fx, fy, cx, cy = keyframe.intrinsics
     (w, h), (rows, columns) = keyframe.size, keyframe.depths.shape
     points = points[points[:, 2] > 0]
     column = np.floor((points[:, 0] / points[:, 2] * fx + cx + 0.5) * columns / w)
     row = np.floor((points[:, 1] / points[:, 2] * fy + cy + 0.5) * rows / h)
     is_inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
-    # The nearest around: beside an edge the image may show the one surface and the point lie on the other. 0 = unknown.
+    # The nearest depth around: beside an edge, image and point may show different surfaces. 0 = unknown.
     nearest = minimum_filter(np.float64(keyframe.depths), 3, mode="nearest")
     shown = nearest[row[is_inside].astype(int), column[is_inside].astype(int)]
     is_through = points[is_inside, 2] < (1 - margin) * shown

@@ -1,1 +1,1 @@
-"""A sequence being mapped: an immutable run, and functions from it and an input to the next one."""
+"""Map a sequence: an immutable run, and functions from it and an input to the next run."""

@@ -1,8 +1,8 @@
-"""The maps of a run, whose relative poses may be unknown, and how two of them become one.
+"""The maps of a run, whose relative poses may be unknown, and how to join two of them.
 
-A prior that has lost the first view may continue in a world of its own. There a new map starts, and the one before
-becomes inactive. Where a frame fits an inactive map, the similarity between its two poses joins both submaps: the newer
-one moves, poses, scales and Gaussians. A saved map is an inactive submap until a frame is found in it.
+A prior that has lost the first view may continue in a world of its own. There a new map starts, and the previous one
+becomes inactive. If a frame fits an inactive map, the similarity between its two poses joins both submaps: poses,
+scales and Gaussians of the newer one move. A saved map is an inactive submap until a frame is relocalized in it.
 """
 
 from collections import Counter
@@ -30,13 +30,13 @@ from emgs_jax.slam import SlamConfig, SlamState
 
 @dataclass(frozen=True)
 class World:
-    """A world of the prior in the submap that is mapped in it.
+    """A world of the prior, and its place in the submap that is mapped in it.
 
     Args:
         number: `WindowInput.world`; 0: that of the first frame.
-        T_world_prior: its pose (4, 4); None: that of the first frame, which predictions have already.
-        T_world_anchor: (4, 4) of the frame about which its lengths are scaled; None likewise.
-        motion: of it since relocalization; None: the identity.
+        T_world_prior: its pose (4, 4); None: that of the first frame, which predictions already include.
+        T_world_anchor: (4, 4), the frame about which its lengths are scaled; None likewise.
+        motion: of this world since relocalization; None: the identity.
     """
 
     number: int = 0
@@ -47,12 +47,12 @@ class World:
 
 @dataclass(frozen=True)
 class Submap:
-    """A map whose pose relative to others is not known.
+    """A map whose pose relative to other maps is unknown.
 
     Args:
-        state: of its SLAM; of a map in which no frame was found yet only map and depth noise say anything.
+        state: its SLAM state; before a frame is relocalized in a saved map, only map and depth noise mean anything.
         is_frozen: True in localization mode: the map and its pose graph stay as they are.
-        worlds: of the prior that lie in it and that the run has left, by their number.
+        worlds: worlds of the prior that lie in it and that the run has left, by number.
     """
 
     state: SlamState
@@ -61,7 +61,7 @@ class Submap:
 
 
 def unvisited(saved: SavedMap, camera: Camera, config: SlamConfig) -> Submap:
-    """Make the submap of a saved map, in which no frame of this camera was found yet."""
+    """Make the submap of a saved map, before any frame of this camera is relocalized in it."""
     view, time = downscale(camera, config.observation.thin), jnp.asarray(len(saved.back_end.nodes), jnp.int32)
     size, width = view.width * view.height, saved.map.gaussians.features.shape[-1]
     estimate = replace(exact_estimate(), depth_noise=jnp.asarray(saved.depth_noise, jnp.float32))
@@ -73,14 +73,14 @@ def unvisited(saved: SavedMap, camera: Camera, config: SlamConfig) -> Submap:
 
 @dataclass(frozen=True)
 class Atlas:
-    """All that the mapping knows after an input. Nothing of it is ever changed in place: each input makes a new one.
+    """Everything that the mapping knows after an input. Immutable: each input makes a new one.
 
     Args:
         config: its capacities grow with the maps.
-        submaps: by their number.
+        submaps: by number.
         graph: poses of all frames, and the number of the active submap, where the camera is.
-        world: of the prior, where the camera is.
-        num_lost: frames up to the last one since one was placed in a map.
+        world: the prior's current world.
+        num_lost: frames since the last one that was placed in a map.
     """
 
     camera: Camera
@@ -107,7 +107,7 @@ class Atlas:
 
 
 def with_state(atlas: Atlas, state: SlamState, config: SlamConfig) -> Atlas:
-    """Set the state of the active submap, and the config with the capacity that it needs; a frozen map stays."""
+    """Set the state of the active submap and the config with its capacities; a frozen map stays."""
     number, before = atlas.graph.active, atlas.active or Submap(state)
     if before.is_frozen:
         map, capacity = before.state.map, config.submap.map_capacity
@@ -116,19 +116,19 @@ def with_state(atlas: Atlas, state: SlamState, config: SlamConfig) -> Atlas:
 
 
 def join_at(atlas: Atlas, similarity: Sim3, place: RelocalizedPose) -> Atlas:
-    """Join the active submap, with this frame as its last node, and the one where the frame was found.
+    """Join the active submap, whose last node is this frame, and the submap in which the frame was relocalized.
 
-    The newer one moves, with the number of the older one; which then is the active one.
+    The newer one moves and gets the number of the older one, which is then active.
 
     Args:
-        similarity: from the active one to the other.
-        place: of the frame there, by a keyframe of the other.
+        similarity: from the active submap to the other.
+        place: pose of the frame in the other, by a keyframe there.
     """
     graph = atlas.graph
     here, there = graph.active, graph.nodes[place.keyframe].submap
     newer, older, before = max(here, there), min(here, there), nodes_of(graph)
     motion = similarity if here == newer else similarity.inverse()
-    unit = np.exp(graph.nodes[place.keyframe].log_scale)  # its map may be the one that moves
+    unit = np.exp(graph.nodes[place.keyframe].log_scale)  # its map may be the newer one, which moves
     graph = transform_nodes(graph, [row for row, one in enumerate(graph.nodes) if one.submap == newer], motion)
     after, min_std, deform = nodes_of(graph), graph.min_std, graph.config.deform
     nodes = tuple(replace(node, submap=older) if node.submap == newer else node for node in graph.nodes)
@@ -140,14 +140,14 @@ def join_at(atlas: Atlas, similarity: Sim3, place: RelocalizedPose) -> Atlas:
     state = replace(state, map=map)
     if here == newer:
         state = replace(state, estimate=rescale_estimate(state.estimate, jnp.asarray(motion.scale, jnp.float32)))
-    # Where another world of the prior lies in a submap that moves is not known any more.
+    # The places of other worlds in a submap that moves are no longer known.
     both = Submap(state, worlds=atlas.submaps[older].worlds)
     others = {number: submap for number, submap in atlas.submaps.items() if number not in (here, there)}
     return replace(atlas, graph=graph, config=config, submaps={older: both, **others})
 
 
 def join_factor(graph: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
-    """Build the join factor of two submaps: the last node relative to the keyframe that relocalized it, as now.
+    """Build the join factor of two submaps: the last node's current pose relative to the keyframe that relocalized it.
 
     `unit` is a length of that keyframe's inference in the map in which the pose was found.
     """
@@ -161,10 +161,10 @@ def join_factor(graph: BackEnd, place: RelocalizedPose, unit: float) -> Factor:
 
 
 def set_unjoined_apart(atlas: Atlas, kept: int | None = None) -> Atlas:
-    """Make a submap the active one; the others stay as they are, apart.
+    """Make a submap the active one; the others stay apart.
 
     Args:
-        kept: its number; None: that of most placed frames, or the saved map's.
+        kept: its number; None: the one with most placed frames, or the saved map.
     """
     if len(atlas.submaps) < 2:
         return atlas

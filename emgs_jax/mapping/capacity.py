@@ -1,4 +1,4 @@
-"""Capacity of maps on the host: executables for it, and its doubling where a map or submap is full."""
+"""Capacity of maps on the host: executables for each size, and doubling when a map or submap is full."""
 
 import contextlib
 from collections.abc import Callable, Iterator
@@ -33,11 +33,11 @@ _preparing = Lock()
 def start(
     first: FirstWindow, camera: Camera, config: SlamConfig, init: Callable = init_state
 ) -> tuple[SlamState, SlamConfig]:
-    """Make the map of the first window; return the state, and the config with the capacity that it needs.
+    """Make the map of the first window; return the state, and the config with sufficient capacity.
 
     Args:
         camera: of the full images.
-        config: all stages; capacities are where to start.
+        config: all stages; its capacities are the first to try.
         init: `init_state`, or its form for stacked configs.
     """
     state, overflow = init(first.views, first.T_world_views, camera, config)
@@ -48,15 +48,15 @@ def start(
 
 
 def restart_map(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[SlamState, SlamConfig]:
-    """Restart the map from its last frame, at that frame's pose, as from a first window of this one view.
+    """Restart the map from its last frame, at that frame's pose, like a first window with this one view.
 
-    For a camera that no longer fits the map and cannot be relocalized in it. All Gaussians of the map stay. Relative to
-    the new ones the frame's pose is exact.
+    This is for a camera that no longer fits the map and cannot be relocalized in it. All Gaussians stay. The frame's
+    pose is exact relative to the new ones.
 
     Args:
         state: after the step of that frame, which has points.
         camera: of the full images.
-        config: all stages; returned with more capacity where the map needs it.
+        config: all stages; returned with more capacity if the map needs it.
     """
     T = state.T_world_previous
     view = transform(T.inverse(), state.previous, jnp.ones(()))
@@ -69,7 +69,7 @@ def restart_map(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[S
 
 
 def add_map(map: GaussianMap, other: GaussianMap, config: SlamConfig) -> tuple[GaussianMap, SlamConfig]:
-    """Insert all Gaussians of a map into another; return it, and the config with the capacity that it needs."""
+    """Insert all Gaussians of a map into another; return that map, and the config with sufficient capacity."""
     both, _, overflow = _insert(map, other)
     while overflow > 0:
         config = grow_capacities(config, _of_map(overflow))
@@ -80,12 +80,12 @@ def add_map(map: GaussianMap, other: GaussianMap, config: SlamConfig) -> tuple[G
 def prepare_step(
     views: Observation, camera: Camera, config: SlamConfig, is_wanted: Callable[[], bool] = lambda: True
 ) -> None:
-    """Compile the executables of `step` side by side, on as many cores as there are; those that are there cost little.
+    """Compile the executables of `step` in parallel on all cores; those that exist cost little.
 
     Args:
         views: observations of the sequence, stacked, or their shapes.
         camera: of the full images.
-        is_wanted: asked before each executable; where it is not, the rest is left.
+        is_wanted: called before each executable; False stops the rest.
     """
     calls: list[tuple[Callable, tuple]] = []
 
@@ -109,7 +109,7 @@ def prepare_step(
     map = _zeros(jax.eval_shape(lambda: empty_map(config.submap.map_capacity, view.features.shape[-1])))
     looks = _zeros(jax.eval_shape(lambda: no_looks(view, config.motion)))
     state = SlamState(map, view, pose, _zeros(jax.eval_shape(exact_estimate)), on_device(np.int32(0)), looks)
-    with _preparing:  # one that began beside the prediction may not have ended
+    with _preparing:  # a compilation that began beside the prediction may still run
         with calling(note):
             step(state, prediction, camera, config)
         compile_all([partial(_compile, *noted) for noted in calls], is_wanted)
@@ -117,12 +117,12 @@ def prepare_step(
 
 @contextlib.contextmanager
 def prepared_beside(camera: Camera, num_features: int, config: SlamConfig) -> Iterator[None]:
-    """`prepare_step` in the background of a block, which reads and predicts the first frames meanwhile.
+    """Run `prepare_step` in the background of a block that reads and predicts the first frames.
 
     Args:
         camera: of the full images.
-        num_features: width of the prior's features; if it is another, the step is compiled for that one when it comes.
-            Any error comes back there, too.
+        num_features: width of the prior's features. If it turns out different, the step is compiled when it first runs;
+            any error appears there, too.
     """
     h, w = camera.height, camera.width
     sizes = ((h, w, 3), "float32"), ((h, w, 3), "float32"), ((h, w, num_features), "float32"), ((h, w), "float32")
@@ -137,13 +137,13 @@ def prepared_beside(camera: Camera, num_features: int, config: SlamConfig) -> It
             ended.set()
 
 
-@full_precision  # as inside `step`: else it is another
+@full_precision  # as inside `step`; otherwise it is another program
 def _compile(executable: Any, arguments: tuple) -> None:
     executable.lower(*arguments).compile()
 
 
 def _of_map(overflow: jax.Array) -> Overflow:
-    """Overflow of a map alone."""
+    """Make the overflow of a map alone."""
     nothing = jnp.zeros_like(overflow)
     return Overflow(map=overflow, submap=nothing, tiles=nothing)
 
@@ -157,10 +157,11 @@ def _zeros(shapes: Any) -> Any:
 def advance(
     state: SlamState, prediction: Prediction, camera: Camera, config: SlamConfig, step: Callable = step
 ) -> tuple[SlamState, StepInfo, SlamConfig]:
-    """Run one step; where a map or submap is full, double its capacity and repeat the frame.
+    """Run one step; if a map or submap is full, double its capacity and repeat the frame.
 
-    That gives the same map as starting with the larger capacity. Splats beyond the tiles' capacity are only counted:
-    where they are missed the refinement makes new Gaussians. `step` is `slam.step`, or its form for stacked states.
+    The result is the same as with the larger capacity from the start. Splats beyond the tiles' capacity are only
+    counted; where they are missing, refinement makes new Gaussians. `step` is `slam.step`, or its form for stacked
+    states.
     """
     new, info = step(state, prediction, camera, config)
     while np.any(info.overflow.map) or np.any(info.overflow.submap):
@@ -172,7 +173,7 @@ def advance(
 
 
 def grow_capacities(config: SlamConfig, overflow: Overflow) -> SlamConfig:
-    """Double the capacities into which rows did not fit; each new size compiles once."""
+    """Double the capacities that overflowed; each new size compiles once."""
     submap = config.submap
     map_factor, submap_factor = (2 if np.any(lost) else 1 for lost in (overflow.map, overflow.submap))
     capacities = submap.map_capacity * map_factor, submap.submap_capacity * submap_factor

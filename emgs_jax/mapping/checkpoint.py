@@ -1,8 +1,8 @@
-"""Checkpoints: a run that was stopped resumes from its maps and its log after some input, saved in one file.
+"""Checkpoints: a stopped run resumes from its maps and its log after some input, saved in one file.
 
-Frames are read and predicted from the start again, because what a prior and its inputs carry along (landmarks of a
-window, raw poses) follows from that alone, the same every time. Nothing of it is mapped again: the maps and the pose
-graph come from the file, so that the result has the same bits as that of an uninterrupted run.
+Frames are read and predicted again from the start, because that reproduces the state of the prior and its inputs
+(landmarks of a window, raw poses) exactly. They are not mapped again: maps and pose graph come from the file, so the
+result has the same bits as that of an uninterrupted run.
 """
 
 from collections.abc import Mapping, Sequence
@@ -43,8 +43,8 @@ class CheckpointConfig:
     """Interval between checkpoints of a run.
 
     Args:
-        every: frames between checkpoints, from which the same command in the same folder resumes; 0 = none: a run that
-            is stopped starts again at its first frame.
+        every: frames between checkpoints, from which the same command in the same folder resumes; 0 = none: a stopped
+            run starts again at its first frame.
     """
 
     every: int = number(50, low=0, high=1_000_000_000)
@@ -55,9 +55,9 @@ class Checkpoint:
     """A run after some of its inputs.
 
     Args:
-        atlas: without camera and config, which the run that resumes has.
+        atlas: without camera and config, which the resuming run has.
         capacities: of the map and the submap of a step.
-        records: as the frames were placed, and what is known by now to have moved in them.
+        records: as the frames were placed, with what later frames have shown to have moved in them.
     """
 
     num_inputs: int
@@ -66,7 +66,7 @@ class Checkpoint:
     records: Sequence[FrameRecord]
 
     def restored(self, run: MappingRun) -> MappingRun:
-        """Set the atlas and the log of a run that resumes."""
+        """Give a resuming run its atlas and log."""
         names = ("map_capacity", "submap_capacity")
         submap = replace(run.config.submap, **dict(zip(names, self.capacities, strict=True)))
         graph = replace(self.atlas.graph, config=run.atlas.graph.config)
@@ -76,7 +76,7 @@ class Checkpoint:
 
 
 def save_checkpoint(path: Path, checkpoint: Checkpoint, signature: Mapping[str, Any]) -> None:
-    """Write a checkpoint of the run that `signature` (as JSON has it) tells from others; the old one is replaced."""
+    """Write a checkpoint of the run that `signature` (of JSON values) identifies; it replaces the old one."""
     graph = replace(checkpoint.atlas.graph, config=None)
     checkpoint = replace(checkpoint, atlas=replace(checkpoint.atlas, camera=None, config=None, graph=graph))
     said, arrays = pack(checkpoint)
@@ -88,7 +88,7 @@ def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
     """Read the checkpoint of the run that `signature` describes.
 
     Raises:
-        ValueError: there is none, it is damaged, or it is of another run; the message names what is different.
+        ValueError: there is none, it is damaged, or it is of another run; the message names the difference.
     """
     try:
         header, arrays = load_headed(path, {"format": FORMAT, "version": VERSION})
@@ -105,10 +105,10 @@ def load_checkpoint(path: Path, signature: Mapping[str, Any]) -> Checkpoint:
 
 
 class Keeper:
-    """Owner of a run's checkpoint file: `found` is the checkpoint to resume from, None where there is none.
+    """Owner of a run's checkpoint file: `found` is the checkpoint to resume from, or None.
 
     Args:
-        config: when it is written; None = never.
+        config: when to write it; None = never.
         signature: settings that must match those of the checkpoint.
     """
 
@@ -117,7 +117,7 @@ class Keeper:
     ) -> None:
         self.path, self._every, self._signature = path, config.every if config else 0, signature
         self.found: Checkpoint | None = None
-        self.note: str | None = None  # why a file that is there is of no use
+        self.note: str | None = None  # why an existing file cannot be used
         self._done: tuple[MappingRun | None, int, tuple[FrameRecord, ...]] = None, 0, ()
         self._num_saved = 0
         if self._every and path.exists():
@@ -128,14 +128,14 @@ class Keeper:
                 self.note = f"{error}; this run starts at its first frame"
 
     def keep(self, run: MappingRun, records: Sequence[FrameRecord]) -> None:
-        """Note a run after its next input, with the new records as first estimated; save it if a checkpoint is due."""
+        """Keep a run after its next input, with the new records as first estimated; save it if a checkpoint is due."""
         _, num_inputs, placed = self._done
         self._done = run, num_inputs + 1, (*placed, *records)
         if len(self._done[-1]) >= self._num_saved + self._every:
             self.save()
 
     def save(self) -> None:
-        """Write the run as it was after its last complete input, if that is not written yet."""
+        """Write the run after its last complete input, unless that is already written."""
         run, num_inputs, placed = self._done
         if not self._every or run is None or len(placed) <= self._num_saved:
             return
@@ -148,5 +148,5 @@ class Keeper:
         self._num_saved = len(placed)
 
     def drop(self) -> None:
-        """Remove the file of a run that is complete."""
+        """Remove the file of a completed run."""
         self.path.unlink(missing_ok=True)

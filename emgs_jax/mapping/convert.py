@@ -1,4 +1,4 @@
-"""From what a prior predicts on the host to the arrays of a step: every check of the input is here."""
+"""Convert a prior's prediction on the host to the arrays of a step, with all checks of the input."""
 
 from collections.abc import Mapping
 
@@ -19,7 +19,7 @@ _observe = eqx.filter_jit(observe)
 
 
 class FirstWindow(eqx.Module):
-    """The first prediction of a sequence: all views, camera frames, oldest first, with the prior's poses.
+    """The first prediction of a sequence: all views in camera frames, oldest first, with the prior's poses.
 
     Args:
         pose_covariance: (n, 2, 6, 6), see `Prediction`.
@@ -33,7 +33,7 @@ class FirstWindow(eqx.Module):
 
 
 def to_camera(dataset: Dataset) -> Camera:
-    """The camera of a data set's frames."""
+    """Make the camera of a data set's frames."""
     fx, fy, cx, cy = dataset.intrinsics
     return Camera((fx, fy), (cx, cy), *dataset.size)
 
@@ -73,7 +73,7 @@ def _check_covariance(prediction: PriorPrediction) -> None:
     if is_sound and len(known):
         variances = np.diagonal(known, axis1=1, axis2=2)
         std = np.sqrt(np.where(variances > 0, variances, 1.0))
-        known = known / std[:, None] / std[:, :, None]  # metres and radians have roundings of their own
+        known = known / std[:, None] / std[:, :, None]  # metres and radians round differently
         is_sound = np.abs(known - known.mT).max() <= 1e-6 and np.linalg.eigvalsh(known).min() >= -1e-6
     if not is_sound:
         raise ValueError(
@@ -92,9 +92,9 @@ def _observation(prediction: PriorPrediction, view: int, frame: Frame, config: O
 
 
 def _pose_covariance(prediction: PriorPrediction, previous: int, current: int) -> np.ndarray:
-    """Covariances (2, 6, 6) of the motion between two views, and of the second one's pose; NaN where not known.
+    """Compute covariances (2, 6, 6) of the motion between two views and of the second one's pose; NaN if unknown.
 
-    Errors of neighbours are alike: the motion is at least as sure as the two poses together.
+    Neighbours share errors, so the motion is at least as certain as the two poses together.
     """
     if prediction.pose_covariance is None:
         return np.full((2, 6, 6), np.nan)
@@ -114,15 +114,15 @@ def to_first_window(
     config: ObservationConfig,
     since: int = 0,
 ) -> tuple[FirstWindow | None, tuple[int, ...]]:
-    """Select the views that a map can start from: the dense ones, from the first with a pose and a valid point on.
+    """Select the views from which a map can start: the dense ones, beginning with the first that has a pose and points.
 
     Args:
         T_world_anchor: known pose of the first frame, (4, 4).
         since: views of earlier frames are left out.
 
     Returns:
-        The views and their frame indices; None and () where there is no such view. A later view may have no pose:
-        integrated on its own, it is lost.
+        The views and their frame indices; None and () without such a view. A later view may have no pose: integrated on
+        its own, it is lost.
 
     Raises:
         ValueError: a shape differs from the images'.
@@ -148,7 +148,7 @@ def to_first_window(
 def to_prediction(
     prediction: PriorPrediction, frames: Mapping[int, Frame], T_world_anchor: np.ndarray, config: ObservationConfig
 ) -> Prediction:
-    """The current and the previous view of one step.
+    """Convert a prediction to the current and the previous view of a step.
 
     Args:
         prediction: dense in (previous, current).
@@ -176,9 +176,9 @@ def to_prediction(
 def opening(window: FirstWindow, config: SlamConfig) -> tuple[FirstWindow, list[Prediction]]:
     """Split the first window into the views that initialize the map and the steps that follow from the same window.
 
-    These are the whole window and none, or (incremental initialisation) the first view alone and each further view as
-    if it were a step's current frame. Consecutive views come from one inference, so the previous image's two
-    predictions agree exactly and the coarse pose of a step is the prior's own.
+    With `merged` initialization these are the whole window and no steps. With `incremental` they are the first view,
+    and each further view as the current frame of a step. Consecutive views come from one inference, so the two
+    predictions of the previous image agree exactly, and the coarse pose of a step is the prior's own.
 
     Raises:
         ValueError: `merged`, and a view has no pose.

@@ -1,4 +1,4 @@
-"""What became of an input: what the pose graph and the log are told of its frames."""
+"""Outcome of an input, from which the pose graph and the log of its frames are made."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
@@ -7,22 +7,22 @@ import numpy as np
 
 from emgs_jax.slam import StepInfo
 
-# Outcomes of relocalization, `Event.location`, as files have them.
+# Outcomes of relocalization, `Event.location`, as written in files.
 RELOCALIZED, RESTARTED, NEW_SUBMAP, JOINED = "relocalized", "restarted", "new_submap", "joined"
 
 
 @dataclass(frozen=True)
 class Event:
-    """Outcome of an input; its frames are more than one where a map was made from them together.
+    """Outcome of an input; it has several frames if a map was made from them together.
 
     Args:
-        poses: T_world_camera (n, 4, 4) as first estimated; of a lost frame a placeholder.
-        is_start: True where a map started from the frames.
-        num_gaussians: in the map afterwards; None where the frame is lost.
+        poses: T_world_camera (n, 4, 4) as first estimated; a placeholder for a lost frame.
+        is_start: True if a map started from the frames.
+        num_gaussians: in the map afterwards; None if the frame is lost.
         is_frozen: True in localization mode: nothing was fused.
         info: result of the step, on the host; None without one.
         location: outcome of relocalization, see `FrameRecord`; None without one.
-        similarity: from the submap of the frame to the one with which it was joined, (4, 4).
+        similarity: from the submap of the frame to the one that it was joined with, (4, 4).
         covariance: (6, 6) of the pose, see `FrameRecord`; None without a step.
         seconds: that it took, see `FrameRecord`.
     """
@@ -39,12 +39,12 @@ class Event:
 
     @property
     def is_tracked(self) -> bool:
-        """True where the frame was registered to the map."""
+        """True if the frame was registered to the map."""
         return self.info is not None and bool(self.info.localization.is_tracked)
 
     @property
     def is_placed(self) -> bool:
-        """True where the map holds the frames."""
+        """True if the map holds the frames."""
         return self.is_start or self.is_tracked
 
     @property
@@ -54,11 +54,11 @@ class Event:
 
     @property
     def depth_noise(self) -> float | None:
-        """How much the points differ from the map, as a fraction of their depth; None where none agrees."""
+        """Difference of the points from the map, as a fraction of their depth; None if none agrees."""
         is_known = self.info is not None and int(self.info.localization.icp.num_inliers)
         return float(self.info.localization.depth_noise) if is_known else None
 
     @property
     def origin(self) -> int | None:
-        """Node whose Gaussians the frame was registered to; None where it was not."""
+        """Node whose Gaussians the frame was registered to; None if it was not registered."""
         return int(self.info.origin) if self.is_tracked else None

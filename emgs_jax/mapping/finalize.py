@@ -1,7 +1,7 @@
-"""The end of a run: what its last frames saw move, its first frame's own covariance, and the unit of the map.
+"""The end of a run: what its last frames saw move, the first frame's own covariance, and the unit of the map.
 
-During a run the unit is that of the first inference, at its end the mean of all inferences'. Covariances of poses are
-relative to the first frame; at the end that one's own is added.
+During a run the unit is that of the first inference; at the end it becomes the mean unit of all inferences. During a
+run covariances of poses are relative to the first frame; at the end its own covariance is added.
 """
 
 from dataclasses import replace
@@ -29,14 +29,14 @@ from emgs_jax.slam import SlamConfig, SlamState, as_seen
 
 
 def end_looks(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[SlamState, list[Seen]]:
-    """Take back what the last frames have said for Gaussians of things that moved: no later frame will say more.
+    """Withdraw the last frames' evidence for Gaussians of things that moved, since no later frame will come.
 
     Args:
         state: with looks.
         camera: of the full images.
 
     Returns:
-        The state, without looks, and those frames, on the host.
+        The state without looks, and these frames, on the host.
     """
     map, seen = _end_looks(state, downscale(camera, config.observation.thin), config.existence)
     seen = jax.device_get(seen)
@@ -56,10 +56,10 @@ def _end_looks(state: SlamState, view: Camera, config: ExistenceConfig) -> tuple
 def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:
     """Estimate the covariance (6, 6) of the first frame's pose, in its own axes, from repeated predictions.
 
-    The first frame is at the end of its window, and the map is held by those in the middle: half a window of motions
-    lies between, each with an error of its own, and what these sum up to is in all later poses. It is not known when
-    the map starts: only the repeated predictions of the whole run show how noisy the motions are. 0 where no prediction
-    has repeated another.
+    The first frame is at the end of its window, whereas the frames in the middle determine the map. Between them lies
+    half a window of motions with independent errors, whose sum enters all later poses. It is not known when the map
+    starts, because only the repeated predictions of the whole run show how noisy motions are. 0 without any repeated
+    prediction.
 
     Args:
         state: after the last step; m of its map.
@@ -85,13 +85,13 @@ def _own_std(
 
 
 def with_first_frame(atlas: Atlas, first: np.ndarray) -> tuple[Atlas, np.ndarray | None]:
-    """Add `own_covariance`, seen from each frame, to those of a run that ends; those in a saved map have none.
+    """Add `own_covariance`, seen from each frame, to those of a run that ends; frames in a saved map have none.
 
     Args:
         first: pose of the first frame, (4, 4).
 
     Returns:
-        The atlas, and what was added of the first frame; None: nothing.
+        The atlas, and the covariance of the first frame that was added, or None.
     """
     graph = atlas.graph
     rows = [row for row in _active_rows(graph) if graph.nodes[row].covariance is not None]
@@ -107,7 +107,7 @@ def with_first_frame(atlas: Atlas, first: np.ndarray) -> tuple[Atlas, np.ndarray
 
 
 def _active_rows(graph: BackEnd) -> list[int]:
-    """Nodes of the active submap; the others are in worlds and units of their own."""
+    """Find the nodes of the active submap; the others are in worlds and units of their own."""
     return [row for row, node in enumerate(graph.nodes) if node.submap == graph.active]
 
 
@@ -115,8 +115,8 @@ def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
     """Rescale a state by e^−γ about `origin`, so that the scales of all predictions are 1 on average.
 
     γ is the mean logarithm of the scales (`PoseEstimate.log_scale`): a length of a prediction times its scale is one of
-    the map. The mean of all predictions errs by less than the first, which gave the map its unit. A state with γ = 0
-    stays as it is.
+    the map. The mean of all predictions is more accurate than the first, which gave the map its unit. A state with γ =
+    0 stays as it is.
 
     Args:
         origin: (3,) of the first camera.
@@ -128,10 +128,10 @@ def in_prior_unit(state: SlamState, origin: np.ndarray) -> SlamState:
 
 
 def rescale_atlas(atlas: Atlas, first: np.ndarray) -> Atlas:
-    """Apply `in_prior_unit` to a run that ends, its pose graph included, about the `first` camera's pose (4, 4).
+    """Apply `in_prior_unit` to a run that ends, including its pose graph, about the `first` camera's pose (4, 4).
 
-    A saved map keeps its unit, and so does one of joined submaps: the mean is of the last one's inferences. Submaps
-    that were never joined stay, poses and maps, in the worlds that they have.
+    A saved map keeps its unit, and so does a map of joined submaps, because the mean is only over the last one's
+    inferences. Submaps that were never joined keep their worlds.
     """
     graph, state = atlas.graph, atlas.state
     if state is None or graph.first_node or not graph.has_one_unit or not state.estimate.log_scale:

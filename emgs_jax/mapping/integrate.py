@@ -1,4 +1,4 @@
-"""One input into an atlas: its frames are placed in a map and fused, and the pose graph closes loops."""
+"""Integrate an input into an atlas: place its frames in a map, fuse them, and close loops."""
 
 import contextlib
 from collections.abc import Mapping, Sequence
@@ -47,14 +47,14 @@ def integrate(
 
 
 def seconds_of(window: WindowInput, timer: Timer, num_sharing: int = 1) -> Mapping[str, float]:
-    """Add the seconds of the conversion to those of a timer, which `num_sharing` runs share equally."""
+    """Add the seconds of conversion to those of a timer, which `num_sharing` runs share equally."""
     return {name: window.seconds.get(name, 0.0) + seconds / num_sharing for name, seconds in timer.read().items()}
 
 
 def update_graph(
     atlas: Atlas, window: WindowInput, event: Event, found: Found | None = None, query: PriorQuery = lambda a, b: None
 ) -> Atlas:
-    """Add frames to the pose graph, join submaps; detect and verify loops, optimize the poses and deform the map."""
+    """Add frames to the pose graph, join submaps, detect and verify loops, optimize the poses and deform the map."""
     if atlas.state is None or atlas.is_frozen:
         return atlas
     atlas = replace(atlas, graph=add_frames(atlas.graph, window, event))
@@ -68,17 +68,17 @@ def update_graph(
 
 
 def join_submaps(atlas: Atlas, window: WindowInput, event: Event, found: Found) -> Atlas:
-    """Join the active submap, which this frame is in, and the one where it was found, too."""
+    """Join the active submap, in which this frame is, with the other one in which it was relocalized."""
     similarity, before = Sim3.from_matrix(event.similarity), atlas.graph.active
     atlas = join_at(atlas, similarity, found.place)
     if atlas.graph.active == before:
         return atlas
-    pose, scale = atlas.graph.nodes[-1].pose, similarity.scale * event.scale  # this frame has moved, and its world
+    pose, scale = atlas.graph.nodes[-1].pose, similarity.scale * event.scale  # this frame and its world have moved
     return replace(atlas, world=anchor_world(atlas.world, window, pose, scale))
 
 
 def add_frames(graph: BackEnd, window: WindowInput, event: Event) -> BackEnd:
-    """Add the frames of an input to the pose graph; relocalized ones and new submaps are not connected."""
+    """Add an input's frames to the pose graph; relocalized frames and new submaps are not connected to earlier ones."""
     is_step = event.is_tracked and not event.is_start
     for frame, pose in zip(window.data, event.poses, strict=True):
         if event.location in (RELOCALIZED, NEW_SUBMAP):
@@ -91,10 +91,10 @@ def add_frames(graph: BackEnd, window: WindowInput, event: Event) -> BackEnd:
 def verify_loops(
     before: BackEnd, window: WindowInput, query: PriorQuery
 ) -> tuple[BackEnd, Sequence[LoopMeasurement] | None]:
-    """Detect loops of the last frame, and verify those that the poses violate by the prior.
+    """Detect loops of the last frame, and query the prior for those that violate the poses.
 
     Returns:
-        The pose graph, and the loops to close now; None where no closure is due.
+        The pose graph, and the loops to close now; None if no closure is due.
     """
     end = detect_loops(before, window.data[-1])
     loops = recent_loops(end)
@@ -107,7 +107,7 @@ def verify_loops(
 
 
 def optimize_and_deform(atlas: Atlas, loops: Sequence[LoopMeasurement]) -> Atlas:
-    """Close loops: optimize the poses, and deform the map; the prior's world moves with the last frame."""
+    """Close loops: optimize the poses and deform the map; the prior's world moves with the last frame."""
     before, motion = atlas.graph.nodes[-1].pose, atlas.world.motion
     graph, state = close_loops(atlas.graph, atlas.state, loops)
     if motion is not None:
@@ -118,8 +118,8 @@ def optimize_and_deform(atlas: Atlas, loops: Sequence[LoopMeasurement]) -> Atlas
 def finish_back_end(atlas: Atlas, query: PriorQuery = lambda a, b: None) -> Atlas:
     """Optimize the poses once more, with all factors, and deform the map accordingly.
 
-    Nothing changes where no loop violates, or has violated, the poses: frames and map fit each other better as first
-    estimated. Else duplicate surfaces are merged that came to lie on each other and that nobody saw again.
+    If no loop violates, or has violated, the poses, nothing changes: frames and map fit each other better as first
+    estimated. Otherwise also merge duplicate surfaces that came to lie on each other and that no later frame saw.
     """
     end = atlas.graph
     end = query_prior(end, violated(end, not_in_graph(end, consistent_loops(end))), query)
@@ -129,7 +129,7 @@ def finish_back_end(atlas: Atlas, query: PriorQuery = lambda a, b: None) -> Atla
     if len(kept.accepted) < len(end.accepted) or kept.accepted or loops:
         atlas = optimize_and_deform(atlas, loops)
     end = atlas.graph
-    if end.accepted or not end.has_one_unit:  # at the end only: what was made one Gaussian stays one
+    if end.accepted or not end.has_one_unit:  # only at the end: merged Gaussians stay merged
         state = merge_duplicates_of_state(atlas.state, end, atlas.config.existence)
         atlas = with_state(atlas, state, atlas.config)
     return atlas

@@ -1,7 +1,7 @@
-"""Two maps into one: a finished run is found in another one by its keyframes, and joined with it by a similarity.
+"""Merge two maps: relocalize a finished run in another one by its keyframes, and join it by a similarity.
 
-Loops between both are verified as those of one run are. The other's unit is free, so that runs of several cameras and
-priors fit each other.
+Loops between both are verified like those of one run, but with a free ratio of units, so that runs of different cameras
+and priors can be joined.
 """
 
 from collections import Counter
@@ -23,16 +23,16 @@ from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.mapping.atlas import Atlas, Submap, with_state
 from emgs_jax.mapping.capacity import add_map
 
-MEASURED = "factors", "verified", "violating", "accepted", "refusals"  # fields of a pose graph between two nodes each
+MEASURED = "factors", "verified", "violating", "accepted", "refusals"  # fields that connect two nodes each
 
 
 def join(atlas: Atlas, other: Atlas) -> Atlas | str:
     """Join the active submap of another atlas with that of `atlas`, whose world and unit stay.
 
-    The other's nodes come after those of `atlas`, and before both those of runs that saved their maps.
+    The other's nodes come after those of `atlas`; nodes of saved maps come before both.
 
     Returns:
-        The atlas of both; or why they cannot be joined.
+        The atlas of both, or why they cannot be joined.
     """
     widths = [one.state.map.gaussians.features.shape[-1] for one in (atlas, other)]
     if widths[0] != widths[1]:
@@ -57,7 +57,7 @@ def join(atlas: Atlas, other: Atlas) -> Atlas | str:
 
 
 def beside(atlas: Atlas, other: Atlas) -> Atlas:
-    """Put the active submap of another atlas beside those of `atlas`, not joined; it gets the next number."""
+    """Add the active submap of another atlas to those of `atlas` without joining it; it gets the next number."""
     number, (a, num_a), (b, num_b) = (
         1 + max(atlas.submaps),
         *((one.graph.first_node, len(one.graph.nodes)) for one in (atlas, other)),
@@ -91,7 +91,7 @@ def with_lost(atlas: Atlas, lost: Sequence[Node]) -> Atlas:
 
 
 def renumbered(atlas: Atlas, rows: Sequence[int], count: int) -> Atlas:
-    """Give the nodes other numbers, among so many, wherever they are named; else the nodes stay as they are."""
+    """Renumber the nodes, among `count`, wherever they are named; nothing else changes."""
     graph, new_births = atlas.graph, jnp.asarray(rows, jnp.int32)
 
     def at(one: Any) -> Any:
@@ -115,12 +115,12 @@ def renumbered(atlas: Atlas, rows: Sequence[int], count: int) -> Atlas:
 
 
 def placement(graph: BackEnd, number: int) -> tuple[Sim3, list[LoopMeasurement]] | str:
-    """Find the similarity that brings a submap into the active one, with which most loops are spatially consistent.
+    """Find the similarity from a submap to the active one with which most loops are spatially consistent.
 
-    Candidates are those of the loops with most inliers, of each keyframe one.
+    Candidates are the similarities of the loops with most inliers, one for each keyframe.
 
     Returns:
-        It and these loops; or why there is none.
+        The similarity and these loops, or why there is none.
     """
     between = [loop for loop in graph.verified if graph.nodes[loop.b].submap == number]
     if not between:
@@ -144,20 +144,20 @@ def placement(graph: BackEnd, number: int) -> tuple[Sim3, list[LoopMeasurement]]
 
 
 def implied(graph: BackEnd, loop: LoopMeasurement) -> Sim3:
-    """Similarity that brings the query of a loop, and its unit, to where the candidate sees it."""
+    """Compute the similarity that moves a loop's query, with its unit, to where the candidate sees it."""
     here, there = graph.nodes[loop.a], graph.nodes[loop.b]
     seen = here.pose @ scale_pose(loop.Z_a_b, float(np.exp(here.log_scale)))
     return motion(there, replace(there, pose=seen, log_scale=here.log_scale + loop.log_ratio))
 
 
 def motion(before: Node, after: Node) -> Sim3:
-    """Similarity that brings a node, and its unit, to where it is after."""
+    """Compute the similarity that moves a node, with its unit, from `before` to `after`."""
     of, to = (Sim3(float(np.exp(one.log_scale)), one.pose[:3, :3], one.pose[:3, 3]) for one in (before, after))
     return to @ of.inverse()
 
 
 def place_submap(graph: BackEnd, number: int, similarity: Sim3) -> BackEnd:
-    """Move the nodes of a submap into the active one, where the uncertainty of their poses is not known."""
+    """Move the nodes of a submap into the active one, where the covariances of their poses are unknown."""
     rows = {row for row, node in enumerate(graph.nodes) if node.submap == number}
     graph = transform_nodes(graph, rows, similarity)
     nodes = tuple(

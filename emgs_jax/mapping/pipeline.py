@@ -1,4 +1,4 @@
-"""The pipeline over a sequence: inputs are integrated one by one into a run, and the log is written."""
+"""The pipeline over a sequence: integrate the inputs one by one into a run, and write its log."""
 
 import contextlib
 from collections import Counter
@@ -27,20 +27,20 @@ def map_frames(
     """Map a sequence, input by input; `finish_run` completes the last run.
 
     Args:
-        keeper: of the run's checkpoint, from which it resumes where there is one.
+        keeper: of the run's checkpoint; if there is one, the run resumes from it.
 
     Yields:
-        The run after an input; the records of its new frames as first estimated; and their raw predictions.
+        The run after an input, the records of its new frames as first estimated, and their raw predictions.
 
     Raises:
-        ValueError: no frame has a point and a pose from which a map can start.
+        ValueError: no frame has points and a pose from which a map can start.
     """
     keeper = keeper or Keeper()
     if run.back_end is not None and run.back_end.config.prior_query.is_used:
         spacing = run.back_end.config.prior_query.spacing
         query = make_prior_query(prior, dataset, spacing, run.config.window_size, run.clock)
         run = replace(run, prior_query=query)
-    resumed, num_known, placed = run, 0, ()  # inputs that are mapped already, and their records
+    resumed, num_known, placed = run, 0, ()  # inputs that are already mapped, and their records
     if keeper.found is not None:
         resumed, num_known, placed = keeper.found.restored(run), keeper.found.num_inputs, keeper.found.records
     try:
@@ -55,15 +55,15 @@ def map_frames(
             yield run, records, window.raw
         keeper.save()
     except BaseException:
-        with contextlib.suppress(OSError):  # the first error is the one to show
+        with contextlib.suppress(OSError):  # show the first error
             keeper.save()
         raise
-    if run.state is None:  # there is a saved map: else a map starts, or there is no input to start one from
+    if run.state is None:  # only with a saved map: otherwise a map has started, or no input could start one
         raise ValueError(not_found_message(run))
 
 
 def not_found_message(run: MappingRun) -> str:
-    """Build the error message of a run of which no frame was relocalized in the saved map, with the reasons."""
+    """Build the error message of a run without any frame relocalized in the saved map, with the reasons."""
     counts = Counter(record.location for record in run.records if record.location is not None)
     reasons = ", ".join(f"{name} {count}" for name, count in counts.most_common())
     return (
@@ -73,7 +73,7 @@ def not_found_message(run: MappingRun) -> str:
 
 
 def map_input(run: MappingRun, window: WindowInput) -> tuple[MappingRun, Sequence[FrameRecord]]:
-    """Integrate one input into a run, and write its log; return it, and the new records as first estimated."""
+    """Integrate one input into a run and write its log; also return the new records as first estimated."""
     if isinstance(window.prediction, FirstWindow):
         timer = Timer(run.clock)
         prepare_step(window.prediction.views, run.camera, run.config)
@@ -84,7 +84,7 @@ def map_input(run: MappingRun, window: WindowInput) -> tuple[MappingRun, Sequenc
 
 
 def with_outcome(run: MappingRun, atlas: Atlas, event: Event) -> MappingRun:
-    """Set the atlas of a run with the records of an input, and write what it says of earlier frames into its log."""
+    """Set the atlas of a run with the records of an input, and update the log of earlier frames by it."""
     if event.info is None or event.info.seen is None:
         return with_atlas(run, atlas)
     time = int(atlas.state.time) - 1
@@ -93,12 +93,12 @@ def with_outcome(run: MappingRun, atlas: Atlas, event: Event) -> MappingRun:
 
 
 def with_atlas(run: MappingRun, atlas: Atlas) -> MappingRun:
-    """Set the atlas of a run, and write where its nodes have moved into the log."""
+    """Set the atlas of a run, and update the log by the moved nodes."""
     return replace(run, atlas=atlas, records=with_moved_nodes(run.records, run.atlas.graph.nodes, atlas.graph.nodes))
 
 
 def finish_run(run: MappingRun, is_interrupted: bool = False) -> MappingRun:
-    """Complete a run after its last input; one that was interrupted gets the same unit, and is not optimized again."""
+    """Complete a run after its last input; an interrupted one gets the mean unit, too, but is not optimized again."""
     time = 0 if run.state is None else int(run.state.time) - 1
     atlas = set_unjoined_apart(run.atlas)
     if len(atlas.submaps) > 1:
@@ -116,7 +116,7 @@ def finish_run(run: MappingRun, is_interrupted: bool = False) -> MappingRun:
 
 
 def with_looks_ended(run: MappingRun, time: int) -> MappingRun:
-    """Apply `end_looks` to a run after its last input; `time` is that of the frame of its last record."""
+    """Apply `end_looks` to a run after its last input; `time` is that of the last record's frame."""
     if run.state is None or run.state.looks is None:
         return run
     state, all_seen = end_looks(run.state, run.camera, run.config)

@@ -1,4 +1,4 @@
-"""The log of a run: a record of each frame, which the mapping never reads, and alarms about frames that do not fit.
+"""The log of a run: a record for each frame, which the mapping never reads, and alarms about frames that do not fit.
 
 A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; files write it as TUM's seven numbers.
 """
@@ -23,14 +23,14 @@ from emgs_jax.mapping.window_input import WindowInput
 from emgs_jax.slam import StepInfo
 
 IN_MAP = ("tracked", "initialization")  # statuses of frames that the map holds
-APART = "apart"  # status of a frame that a submap holds which was never joined with the map
-UNPLACED = ("lost", APART)  # statuses of frames whose pose says nothing in the map
+APART = "apart"  # status of a frame in a submap that was never joined with the map
+UNPLACED = ("lost", APART)  # statuses of frames without a meaningful pose in the map
 HIDDEN = "moving things fill the view"
 NOT_FOUND = "its place in the saved map is not found"
 UNJOINED = "its submap was never joined with the map (unjoined)"
-MANY_IN_A_ROW = 10  # single frames fail in every long sequence, so many together do not
+MANY_IN_A_ROW = 10  # single frames fail in every long sequence, but not this many in a row
 UNTRACKED = ("degraded", "lost")
-MOST_MOVING = 0.5  # of the pixels; where more move it is they that hide the map
+MOST_MOVING = 0.5  # of the pixels; if more move, they are what hides the map
 REMEDIES = dict(
     zip(
         REASONS,
@@ -56,43 +56,43 @@ REMEDIES = dict(
 
 @dataclass(frozen=True)
 class FrameRecord:
-    """Outcome of one frame: a line of frames.jsonl. None where a frame was not a step.
+    """Outcome of one frame: a line of frames.jsonl. Fields of a step are None for a frame that was no step.
 
     Args:
         status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
-            initialization (the map was made from it), apart (a submap holds it that was never joined with the map) or
-            skipped (it cannot be read).
+            initialization (the map was made from it), apart (in a submap that was never joined with the map) or skipped
+            (it cannot be read).
         location: outcome of relocalization: `relocalized`, and the run continues from there; `restarted`, and the map
-            does so from its coarse pose; or the reason of the failure. `new_submap`: a disconnected submap starts;
-            `joined`: this frame connects it.
-        pose: T_world_camera; of a lost frame what stands in for it.
-        raw_pose: the same by the raw prediction; that of the frame before where it has none.
-        true_pose: None where unknown.
+            restarts from the coarse pose; or the reason of the failure. `new_submap`: a disconnected submap starts;
+            `joined`: this frame joins it.
+        pose: T_world_camera; a placeholder for a lost frame.
+        raw_pose: the same by the raw prediction; that of the previous frame if there is none.
+        true_pose: None if unknown.
         newest_pose: temporary pose of the next frame, as first estimated.
-        covariance: (6, 6) of ξ where the true pose is T Exp(ξ), translation (m), rotation (rad); of the pose as first
-            estimated, relative to the first frame (to a saved map in one).
+        covariance: (6, 6) of ξ, if the true pose is T Exp(ξ): translation (m), rotation (rad); of the pose as first
+            estimated, relative to the first frame (or to a saved map).
         inliers: points that agree with the map.
-        residual: of these to the map's planes, as a fraction of their depth.
-        scale: factor on the prediction's lengths; the frames that a map is made from give it its unit.
-        depth_noise: how much the points differ from the map, as a fraction of their depth; None where none agrees.
+        residual: of the inliers to the map's planes, as a fraction of their depth.
+        scale: factor on the prediction's lengths; the frames that a map is made from define its unit.
+        depth_noise: difference of the points from the map, as a fraction of their depth; None if none agrees.
         step_m: between the coarse and the fine pose.
-        similarity: where it is `joined`, the motion of its submap into the other: (4, 4) with e^σ R in the place of R.
-        submap: number of the submap that holds it where it is apart; its pose is in that one's world.
+        similarity: of a `joined` frame, the motion of its submap into the other: (4, 4) with e^σ R in place of R.
+        submap: number of the submap of an `apart` frame; its pose is in that submap's world.
         origin: frame whose Gaussians it was registered to (median of their births), counted from the map's first one.
         repeat_rms: robust standard deviation between the two predictions of the previous image, m.
         left_out: pixels with a prediction that is not finite, behind the camera or farther than a map can hold.
-        moving: share of the pixels that are taken for moving, also by frames that came later.
-        moving_pixels: which of the thinned image, see `to_run_lengths`; None where none is.
-        fused: points that moved Gaussians.
-        updated: Gaussians that they moved.
+        moving: share of moving pixels, including those found by later frames.
+        moving_pixels: which pixels of the thinned image move, see `to_run_lengths`; None if none do.
+        fused: points that were fused into Gaussians.
+        updated: Gaussians that they updated.
         mean_log_joint: of the fused points with their best Gaussians.
         candidates: Gaussians made from the points that were not fused.
         refined: of these, merged on the image plane.
         new: of these, added to the map.
         num_gaussians: in the map after this frame.
-        overflow: splats beyond the capacity that would be seen.
-        seconds: of mapping (conversion and step), compilation included.
-        compile_seconds: of these.
+        overflow: splats that did not fit and would be visible.
+        seconds: of mapping (conversion and step), including compilation.
+        compile_seconds: of compilation.
     """
 
     index: int
@@ -132,7 +132,7 @@ class FrameRecord:
 
 
 def records_apart(records: Sequence[FrameRecord], number: int) -> list[FrameRecord]:
-    """Those that the submap of this number holds, which was never joined with the map."""
+    """Select the records in the submap of this number, which was never joined with the map."""
     return [record for record in records if record.submap == number and record.status == APART]
 
 
@@ -202,10 +202,10 @@ def _step_fields(info: StepInfo) -> dict[str, Any]:
 def with_moved_nodes(
     records: Sequence[FrameRecord], before: Sequence[Node], after: Sequence[Node]
 ) -> Sequence[FrameRecord]:
-    """Write pose, scale and covariance of nodes that have changed into their records: the last node has the last one.
+    """Update the records of changed nodes by pose, scale and covariance; the last node has the last record.
 
     Args:
-        before: nodes when the records were written, but for those that were added with the last records.
+        before: nodes when the records were written, except those added with the last records.
     """
     found, first = list(records), len(records) - len(after)
     for row in range(max(0, -first), len(after)):
@@ -218,7 +218,7 @@ def with_moved_nodes(
 
 
 def with_unjoined_apart(records: Sequence[FrameRecord], nodes: Sequence[Node], kept: int) -> Sequence[FrameRecord]:
-    """Mark the records of all nodes that are not in the kept submap: it was never joined with theirs."""
+    """Mark the records of all nodes outside the kept submap as apart: theirs was never joined with it."""
     found, first = list(records), len(records) - len(nodes)
     for row in range(max(0, -first), len(nodes)):
         node, record = nodes[row], found[first + row]
@@ -230,7 +230,7 @@ def with_unjoined_apart(records: Sequence[FrameRecord], nodes: Sequence[Node], k
 
 
 def with_moved_pixels(records: Sequence[FrameRecord], seen: Seen, time: int, shape: tuple[int, int]) -> Sequence:
-    """Write what later frames have shown to have moved in an earlier one into its record.
+    """Update an earlier frame's record by what later frames have shown to move in it.
 
     Args:
         seen: that frame, on the host.
@@ -254,7 +254,7 @@ def to_line(record: FrameRecord) -> dict[str, Any]:
 
 
 def alarm(records: Sequence[FrameRecord]) -> str | None:
-    """Return the message after a run's last record, if any: frames in a row untracked, tracked again, or new submap."""
+    """Return the message after a run's last record, if any: many untracked frames, tracked again, or a new submap."""
     if not records:
         return None
     if records[-1].location == RESTARTED:
@@ -307,7 +307,7 @@ def called(record: FrameRecord) -> str:
 
 
 def _last_row(records: Sequence[FrameRecord], most: int) -> Sequence[FrameRecord]:
-    """Return the untracked frames at the end, `most` at most."""
+    """Return the untracked frames at the end, at most `most`."""
     count = 0
     while count < min(most, len(records)) and records[-1 - count].status in UNTRACKED:
         count += 1
@@ -315,7 +315,7 @@ def _last_row(records: Sequence[FrameRecord], most: int) -> Sequence[FrameRecord
 
 
 def show_records(bar: tqdm, records: Sequence[FrameRecord], num_new: int) -> None:
-    """Advance the progress bar by the new records and print an alarm where many frames in a row are untracked."""
+    """Advance the progress bar by the new records, and print an alarm if many frames in a row are untracked."""
     for count in range(len(records) - num_new + 1, len(records) + 1):
         message = None if bar.disable else alarm(records[:count])
         if message is not None:

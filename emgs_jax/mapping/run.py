@@ -31,10 +31,11 @@ class MappingRun:
     """A run so far: its maps, and the log of its frames.
 
     Args:
-        clock: counts load, predict and map.
-        records: written from what became of the frames; the mapping does not read them.
+        clock: measures load, predict and map.
+        records: outcomes of the frames; the mapping does not read them.
         prior_query: predicts both visits of a loop, see `prior_queries`.
-        first_covariance: (6, 6) of the first frame, as frames were placed, when the run has ended (`with_first_frame`).
+        first_covariance: (6, 6) of the first frame, in the unit in which frames were placed; set at the end of the run
+            (`with_first_frame`).
     """
 
     atlas: Atlas
@@ -45,12 +46,12 @@ class MappingRun:
 
     @property
     def camera(self) -> Camera:
-        """Of the full images."""
+        """Camera of the full images."""
         return self.atlas.camera
 
     @property
     def config(self) -> SlamConfig:
-        """All stages, with the capacities that the maps need."""
+        """Configs of all stages, with the capacities that the maps need."""
         return self.atlas.config
 
     @property
@@ -60,12 +61,12 @@ class MappingRun:
 
     @property
     def back_end(self) -> BackEnd | None:
-        """Pose graph; None without one: poses stay as first estimated."""
+        """Pose graph; None without a back end: poses stay as first estimated."""
         return None if self.atlas.graph.config is None else self.atlas.graph
 
     @property
     def apart(self) -> Mapping[int, SlamState]:
-        """States of submaps that are not joined with the map, by their number; none before there is a map."""
+        """States of submaps that are not joined with the map, by number; empty before there is a map."""
         others = {} if self.state is None else self.atlas.submaps
         return {number: one.state for number, one in others.items() if number != self.atlas.graph.active}
 
@@ -86,7 +87,7 @@ class MappingRun:
 
     @property
     def true_poses(self) -> list[np.ndarray | None]:
-        """True poses of the data set, likewise; None where unknown."""
+        """True poses of the data set, likewise; None if unknown."""
         return [record.true_pose for record in self.records]
 
 
@@ -100,8 +101,7 @@ def new_run(
     """Make a run of `dataset` before its first frame; `graph` gives it a back end, `saved` that of an earlier run.
 
     Raises:
-        ValueError: `saved`, and the map of the first window is to be made from all of its views at once; or JAX
-            computes in float64.
+        ValueError: `saved` is combined with `merged` initialization, or JAX computes in float64.
     """
     if jax.config.jax_enable_x64:
         raise ValueError(
@@ -123,7 +123,7 @@ def new_run(
 
 
 def clamped(config: SlamConfig, camera: Camera) -> list[str]:
-    """Say which settings have no effect on images of this size, and what is done instead."""
+    """Describe settings that have no effect on images of this size, and what happens instead."""
     found, least = [], MIN_ROWS * config.observation.thin**2 * REFERENCE / (camera.width * camera.height)
     if config.fit.points_per_gaussian < math.floor(least):
         found.append(
@@ -141,19 +141,19 @@ def clamped(config: SlamConfig, camera: Camera) -> list[str]:
 
 @cache
 def warn_once(words: str) -> None:
-    """Print a warning that no later run of this process repeats."""
+    """Print a warning once per process."""
     print(f"warning: {words}", file=sys.stderr)
 
 
 def row_of_first_node(run: MappingRun) -> int:
-    """Return the row of the first record that is a node of the back end; all later ones are nodes, too."""
+    """Return the row of the first record that is a node of the back end; all later records are nodes, too."""
     return len(run.records) - (len(run.back_end.nodes) - run.back_end.first_node)
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
     """Return poses and true poses (n, 4, 4) of the frames whose truth is known; None without any.
 
-    Frames of submaps that were never joined are left out: their poses are in a world of their own.
+    Frames of submaps that were never joined are left out, because their poses are in a world of their own.
     """
     rows = zip(poses, run.true_poses, run.records, strict=True)
     pairs = [(pose, true) for pose, true, record in rows if true is not None and record.status != APART]

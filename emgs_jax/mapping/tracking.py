@@ -1,6 +1,6 @@
-"""Where an input is: it starts a map, is tracked in the active submap, or is found in one by its keyframes.
+"""Place an input: start a map from it, track it in the active submap, or relocalize it in one by keyframes.
 
-A prior that has lost the first view may continue in a world of its own; where a frame is found that world is placed.
+A prior that has lost the first view may continue in a world of its own; relocalizing a frame places that world.
 """
 
 from dataclasses import dataclass, replace
@@ -25,17 +25,17 @@ from emgs_jax.observation import Prediction, depth_in, no_covariance, transform,
 from emgs_jax.registration.rigid import pose_row, scale_translation
 from emgs_jax.slam import SlamConfig, SlamState, StepInfo
 
-FINE_POSE = "fine_pose"  # reason of a rejection: at the relocalized pose the frame does not fit the map
+FINE_POSE = "fine_pose"  # reason of a rejection: the frame does not fit the map at the relocalized pose
 UNKNOWN = np.full((4, 4), np.nan)  # pose
 
 
 @dataclass(frozen=True)
 class Found:
-    """A frame found in a submap, which may be the active one.
+    """A frame that was relocalized in a submap, perhaps the active one.
 
     Args:
-        place: as keyframes say it.
-        after: state of the submap, result of the step that begins there, and config.
+        place: pose by keyframes.
+        after: the submap's state, the result of the step that starts there, and config.
     """
 
     submap: int
@@ -47,7 +47,7 @@ def place(atlas: Atlas, window: WindowInput) -> tuple[Atlas, Event, Found | None
     """Start a map or a submap from an input, or step with it: localize, fuse, refine, insert.
 
     Returns:
-        The atlas, what became of the frames, and where they were found in another submap, which is joined then.
+        The atlas, the outcome of the frames, and the frame's place in another submap, if it is to be joined.
     """
     if window.prediction is None:
         return atlas, lost_event(atlas, window), None
@@ -66,18 +66,18 @@ def place(atlas: Atlas, window: WindowInput) -> tuple[Atlas, Event, Found | None
 
 
 def lost_event(atlas: Atlas, window: WindowInput, location: str | None = None) -> Event:
-    """Make the event of a frame that is in no map; its pose is the anchor's, or the saved map's last one."""
+    """Make the event of a frame that is in no map; its pose is the anchor's, or the last one of the saved map."""
     nodes = atlas.graph.nodes
     return Event((nodes[-1].pose if nodes else window.T_world_anchor)[None], location=location)
 
 
 def start_event(atlas: Atlas, window: WindowInput) -> Event:
-    """Make the event of the frames that a map has started from; raise ValueError where that map is empty."""
+    """Make the event of the frames from which a map started; raise ValueError if that map is empty."""
     count = int(np.asarray(atlas.state.map.gaussians.valid).sum())
-    if atlas.graph.active != 0:  # nothing says where it is
+    if atlas.graph.active != 0:  # its place is unknown
         return Event(atlas.graph.nodes[-1].pose[None], is_start=True, num_gaussians=count, location=NEW_SUBMAP)
     poses = np.asarray(window.prediction.T_world_views.wxyz_xyz)
-    if count == 0:  # no later frame could be localised in it
+    if count == 0:  # no later frame could be localized in it
         num_points = int(np.asarray(window.prediction.views.valid).sum())
         raise ValueError(
             f"the map is empty after {len(poses)} view(s) from {window.frames[0].name}: of {num_points} valid points "
@@ -100,11 +100,11 @@ def step_event(atlas: Atlas, info: StepInfo, location: str | None = None) -> Eve
 
 
 def covariance_of_map(graph: BackEnd, pose: np.ndarray, origin: int | None) -> np.ndarray:
-    """Covariance (6, 6), seen from a pose, of the part of the map it was registered to, relative to the first frame.
+    """Compute the covariance (6, 6) of the part of the map that a pose was registered to, relative to the first frame.
 
-    That part errs as a whole by what the frame erred that it was made of, the origin: on a way out errors add up from
-    one origin to the next, and where a place is seen again they are what they were. A frame that nothing in the map
-    explains has the origin of the frame before. A saved map is exact.
+    It is expressed in the axes of the pose. That part has the error of the frame that made it, the origin. Along a walk
+    errors add up from one origin to the next; at a place that is seen again they are as before. A frame that nothing in
+    the map explains takes the origin of the previous frame. A saved map counts as exact.
     """
     rows = (origin, *(node.origin for node in reversed(graph.nodes)))
     row = next((row for row in rows if row is not None and row < len(graph.nodes)), None)
@@ -120,13 +120,13 @@ def is_related(world: World, window: WindowInput) -> bool:
 
 
 def place_world(window: WindowInput, pose: np.ndarray) -> World:
-    """Place the world of an input by the pose of its frame in the map; lengths are scaled about that frame."""
+    """Place the world of an input by its frame's pose in the map; lengths are scaled about that frame."""
     own = window.T_anchor_views.get(window.frames[0].index, UNKNOWN)
     return World(window.world, pose @ np.linalg.inv(own), pose)
 
 
 def anchor_world(world: World, window: WindowInput, pose: np.ndarray, scale: float) -> World:
-    """Anchor the prior's world at a frame that was relocalized, by its pose and scale."""
+    """Anchor the prior's world at a relocalized frame, by its pose and scale."""
     if not is_related(world, window):  # the prior continues in a world of its own, which moves with this frame
         return replace(place_world(window, pose), motion=jaxlie.SE3.identity())
     prediction = step_prediction(world, window)
@@ -134,7 +134,7 @@ def anchor_world(world: World, window: WindowInput, pose: np.ndarray, scale: flo
 
 
 def step_prediction(world: World, window: WindowInput) -> Prediction:
-    """Return a step's prediction in the world of the map; without poses where they are not related to it."""
+    """Return a step's prediction in the world of the map; without poses if they are not related to it."""
     prediction = as_step_prediction(window.prediction)
     if world.T_world_prior is None or not is_related(world, window):
         return prediction
@@ -145,7 +145,7 @@ def step_prediction(world: World, window: WindowInput) -> Prediction:
 
 
 def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
-    """Convert the first view of a sequence to a step's input; return a step's input as it is."""
+    """Convert the first view of a sequence to a step's input; return the input of a step unchanged."""
     if isinstance(opening, Prediction):
         return opening
     view, T = jax.tree.map(lambda leaf: leaf[0], opening.views), pose_row(opening.T_world_views, 0)
@@ -162,7 +162,7 @@ def as_step_prediction(opening: FirstWindow | Prediction) -> Prediction:
 
 
 def anchor_motion(prediction: Prediction, T_world_camera: jaxlie.SE3, scale: jnp.ndarray) -> jaxlie.SE3:
-    """Return the motion of the prior's world that brings its own current pose, scaled about the anchor, to this one."""
+    """Return the motion of the prior's world that takes its own current pose, scaled about the anchor, to this one."""
     anchor, current = prediction.T_world_anchor, pose_row(prediction.T_world_views, 1)
     return T_world_camera @ scale_translation(anchor.inverse() @ current, scale).inverse() @ anchor.inverse()
 
@@ -170,7 +170,7 @@ def anchor_motion(prediction: Prediction, T_world_camera: jaxlie.SE3, scale: jnp
 def move_prediction(prediction: Prediction, motion: jaxlie.SE3 | None) -> Prediction:
     """Apply a motion of the prior's world to a prediction; None changes nothing.
 
-    It comes of relocalization, so that how sure the prior is of its poses in its own world says little of them here.
+    The motion comes from relocalization, so the prior's uncertainty in its own world says little about poses here.
     """
     if motion is None:
         return prediction
@@ -182,10 +182,10 @@ def move_prediction(prediction: Prediction, motion: jaxlie.SE3 | None) -> Predic
 
 
 def begin(atlas: Atlas, window: WindowInput) -> Atlas | None:
-    """Start the first map; or a submap of this frame alone where the prior's world is not related to any known one.
+    """Start the first map, or a submap from this frame alone if the prior's world is not related to any known one.
 
-    A submap starts at the pose of the frame before, in the prior's own unit: that of another map does not apply.
-    Returns None where none starts.
+    A submap starts at the pose of the previous frame, in the prior's own unit, because that of another map does not
+    apply. Returns None if none starts.
     """
     if not atlas.submaps:
         return with_state(atlas, *start(window.prediction, atlas.camera, atlas.config))
@@ -202,19 +202,22 @@ def begin(atlas: Atlas, window: WindowInput) -> Atlas | None:
     map = replace(alone.map, birth=jnp.full_like(alone.map.birth, before.time))
     atlas = _with_world_left(atlas)
     atlas = replace(atlas, graph=replace(graph, active=max(atlas.submaps) + 1), world=place_world(window, last))
-    return with_state(atlas, replace(alone, map=map, time=before.time + 1), config)
+    looks = alone.looks
+    if looks is not None:  # those of this frame; the others have not been
+        looks = replace(looks, time=jnp.where(looks.time < 0, looks.time, looks.time + before.time))
+    return with_state(atlas, replace(alone, map=map, time=before.time + 1, looks=looks), config)
 
 
 def _with_world_left(atlas: Atlas) -> Atlas:
-    """Note in the active submap where the prior's world lies that the run leaves."""
+    """Remember in the active submap the place of the prior's world that the run leaves."""
     left = replace(atlas.active, worlds={**atlas.active.worlds, atlas.world.number: atlas.world})
     return replace(atlas, submaps={**atlas.submaps, atlas.graph.active: left})
 
 
 def return_to_world(atlas: Atlas, window: WindowInput) -> Atlas:
-    """Switch to the world of this frame where the run has been in it before, and to its submap.
+    """Switch to the world of this frame, and to its submap, if the run has been in it before.
 
-    Nothing of the frame before is known there: the step starts at the pose that the prior predicts.
+    Nothing is known there about the previous frame, so the step starts at the pose that the prior predicts.
     """
     known = (number for number, submap in atlas.submaps.items() if window.world in submap.worlds)
     number = None if atlas.state is None or is_related(atlas.world, window) else next(known, None)
@@ -228,7 +231,7 @@ def return_to_world(atlas: Atlas, window: WindowInput) -> Atlas:
 
 
 def _step(atlas: Atlas, window: WindowInput) -> tuple[Atlas, StepInfo | None]:
-    """Run one step; nothing happens where the camera has no pose yet."""
+    """Run one step; do nothing if the camera has no pose yet."""
     if atlas.state is None:
         return atlas, None
     prediction = move_prediction(step_prediction(atlas.world, window), atlas.world.motion)
@@ -239,10 +242,10 @@ def _step(atlas: Atlas, window: WindowInput) -> tuple[Atlas, StepInfo | None]:
 def relocalize_lost(
     before: Atlas, after: Atlas, window: WindowInput, info: StepInfo | None
 ) -> tuple[Atlas, StepInfo | None, str | None]:
-    """Relocalize a lost camera, and repeat its step at the pose found; restart the map where that fails for long.
+    """Relocalize a lost camera and repeat its step at that pose; restart the map if this fails for long.
 
     Args:
-        after: the step, with the pose that it has estimated.
+        after: result of the step, with the pose that it estimated.
 
     Returns:
         The atlas, the step's result, and the outcome of relocalization.
@@ -269,8 +272,8 @@ def is_relocalization_due(atlas: Atlas, info: StepInfo | None) -> bool:
 def is_restart_due(atlas: Atlas, window: WindowInput, state: SlamState, info: StepInfo) -> bool:
     """Test whether the map restarts from a frame that was not relocalized, at the pose that the prior predicts.
 
-    Only after many untracked frames, and where the prior connects a frame in the map with this one and knows what it
-    sees: there are points, and its two predictions of the previous image agree.
+    It does so only after many untracked frames, and only if the prior connects a frame in the map with this one and its
+    geometry is plausible: there are points, and its two predictions of the previous image agree.
 
     Args:
         atlas: before this frame.
@@ -286,10 +289,10 @@ def is_restart_due(atlas: Atlas, window: WindowInput, state: SlamState, info: St
 
 
 def _is_connected(end: BackEnd, window: WindowInput) -> bool:
-    """Test whether a chain of predictions, each of two consecutive frames, leads from the map to the given frame.
+    """Test whether a chain of predictions, each of two consecutive frames, connects the map with the given frame.
 
-    Frames that the prior itself has lost are skipped, where a later prediction shows frames of both sides. The anchor
-    does not count as a link: a prior that has lost the connection predicts a pose of the anchor, too.
+    Frames that the prior itself lost are skipped if a later prediction has frames on both sides. The anchor does not
+    count as a link, because a prior that lost the connection also predicts a pose of the anchor.
     """
     here, before = (window.T_anchor_views.get(window.frames[0].index - offset) for offset in (0, 1))
     if here is None or before is None or not np.isfinite([here, before]).all():
@@ -309,11 +312,11 @@ def _num_untracked(atlas: Atlas, info: StepInfo) -> int:
 
 
 def locate(atlas: Atlas, window: WindowInput, in_other_submap: bool = False) -> Found | str:
-    """Find a frame in a submap: by its keyframes, and then by a step from there; or return why that fails.
+    """Relocalize a frame in a submap: by keyframes, then by a step from that pose; or return why this fails.
 
     Args:
-        in_other_submap: search the other submap that has the most similar keyframe, with a free ratio of units; else
-            the one where the camera is. Before it is in any, that is the saved map.
+        in_other_submap: search the other submap with the most similar keyframe, with a free ratio of units; otherwise
+            the submap where the camera is, which at first is the saved map.
     """
     graph = atlas.graph
     place, failure = relocalize_frame(graph, window.data[0], in_other_submap)
@@ -334,11 +337,11 @@ def relocalized_start(
 ) -> tuple[SlamState, Prediction]:
     """Return a state and prediction whose step starts at the relocalized pose: this frame is its own previous one.
 
-    Without `is_same_unit` this frame determines the prior's unit: in another map, or where the prior's lengths are no
-    longer those of the steps before.
+    Without `is_same_unit`, this frame determines the prior's unit: in another map, or if the prior's lengths are no
+    longer those of earlier steps.
 
     Raises:
-        ValueError: the features of a saved map are not as wide as those of this run.
+        ValueError: the features of a saved map and of this run differ in width.
     """
     widths = state.map.gaussians.features.shape[-1], prediction.current.features.shape[-1]
     if widths[0] != widths[1]:
@@ -364,7 +367,7 @@ def relocalized_start(
 def rejection(
     info: StepInfo, prediction: Prediction, place: RelocalizedPose, config: RelocalizationConfig
 ) -> str | None:
-    """Return why the map rejects a relocalized pose (too few inliers, or they move it too far); None if it does not."""
+    """Return why the map rejects a relocalized pose (too few inliers, or too large a step); None if it accepts it."""
     found, current = info.localization, prediction.current
     depth = np.median(np.asarray(current.points[:, 2])[np.asarray(current.valid)]) * np.exp(place.log_scale)
     agrees = bool(found.is_tracked) and float(found.icp.inlier_fraction) >= config.min_inlier_fraction
@@ -373,9 +376,9 @@ def rejection(
 
 
 def _found_in_other_submap(atlas: Atlas, window: WindowInput, event: Event) -> tuple[Event, Found | None]:
-    """Find a tracked frame in an inactive submap; where that succeeds, it gets the similarity of both worlds.
+    """Relocalize a tracked frame in an inactive submap; if that succeeds, its event gets the similarity of both worlds.
 
-    The relocalized pose must pass the tests of a lost camera's, the fit to the map included.
+    The relocalized pose must pass the same tests as a lost camera's, including the fit to the map.
     """
     if len(atlas.submaps) < 2 or event.location is not None or not event.is_tracked:
         return event, None
@@ -387,6 +390,6 @@ def _found_in_other_submap(atlas: Atlas, window: WindowInput, event: Event) -> t
 
 
 def camera_in_world(info: StepInfo) -> Sim3:
-    """Similarity from a camera's frame, in the unit of its prediction, to the world."""
+    """Make the similarity from a camera's frame, in the unit of its prediction, to the world."""
     T = to_matrix(np.asarray(info.T_world_camera.wxyz_xyz))
     return Sim3(float(info.localization.scale), T[:3, :3], T[:3, 3])

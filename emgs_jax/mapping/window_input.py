@@ -1,4 +1,4 @@
-"""Inputs of a run, window by window: frames are read, predicted and converted when they are needed."""
+"""Inputs of a run, window by window: read, predict and convert frames when they are needed."""
 
 from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
@@ -21,14 +21,14 @@ from emgs_jax.slam import SlamConfig
 class RawView(NamedTuple):
     """Raw prediction of a frame: points (h, w, 3), camera frame, and the mask of those that are confident enough.
 
-    The mapping leaves out points without a normal as well. `num_left_out` points that the prior gives are none: not
+    The mapping also leaves out points without a normal. `num_left_out` counts predictions that are no points: not
     finite, behind the camera, or farther than a map can hold.
     """
 
     points: np.ndarray
     mask: np.ndarray
     image: np.ndarray
-    T_world_camera: np.ndarray  # of the frame before where the prior has none
+    T_world_camera: np.ndarray  # that of the previous frame if the prior has none
     features: np.ndarray  # (y, x, f), a grid that covers the image
     num_left_out: int = 0
 
@@ -38,13 +38,13 @@ class WindowInput:
     """One input of a run: a frame or several, with their prediction.
 
     Args:
-        frames: one; several where the map is made from all of them.
-        prediction: views that the map starts from, or the prediction of a step; None where no map can start yet.
-        T_world_anchor: known pose of the first frame; NaN where the inference is not related to it.
+        frames: one, or several if the map is made from all of them.
+        prediction: views that the map starts from, or the prediction of a step; None if no map can start yet.
+        T_world_anchor: known pose of the first frame; NaN if the inference is not related to it.
         T_anchor_views: predicted pose of every view of the window, by frame index.
         seconds: of the conversion.
-        world: number of the world that `T_anchor_views` are in, see `PriorPrediction`; 0: that of the first frame.
-            For any other, `prediction` has no pose: the camera's pose in the world is not known.
+        world: number of the world of `T_anchor_views`, see `PriorPrediction`; 0: that of the first frame. In any other
+            world `prediction` has no pose, because the camera's pose in the map is unknown.
     """
 
     frames: tuple[Frame, ...]
@@ -69,11 +69,11 @@ def window_inputs(
 ) -> Iterator[WindowInput]:
     """Yield all inputs of a sequence: frames from which no map can start, the first window, then steps.
 
-    The pose of the first frame is the true one where it is known, else the identity.
+    The pose of the first frame is the true one if known, otherwise the identity.
 
     Raises:
-        ValueError: no frame has a point and a pose from which a map can start, or predictions are in no unit that
-            thresholds are for.
+        ValueError: no frame has points and a pose from which a map can start, or the thresholds do not suit the unit of
+            the predictions.
     """
     done: dict[int, np.ndarray] = {}  # raw poses
     is_started, clock, world, known = False, clock or Clock(), 0, set()
@@ -103,7 +103,7 @@ def window_inputs(
 def predictions(
     dataset: Dataset, prior: Prior, window_size: int, clock: Clock
 ) -> Iterator[tuple[PriorPrediction, dict[int, Frame]]]:
-    """Predict window by window; a frame is read when a window needs it and dropped when none does."""
+    """Predict window by window; read a frame when a window needs it, and drop it when none does."""
     calls = windows(len(dataset), window_size, prior.num_newer(window_size))
     for window, frames in clock.each("load", with_frames(calls, dataset)):
         with clock.phase("predict"):
@@ -112,7 +112,7 @@ def predictions(
 
 
 def first_pose(frames: Mapping[int, Frame]) -> np.ndarray:
-    """Return T_world_camera of the anchor, (4, 4) float64; the identity where the truth is unknown."""
+    """Return T_world_camera of the anchor, (4, 4) float64; the identity if the truth is unknown."""
     truth = frames[0].T_world_camera
     return np.eye(4) if truth is None else np.asarray(truth, np.float64)
 
@@ -165,7 +165,7 @@ def _raw_views(
     done: dict[int, np.ndarray],
     config: SlamConfig,
 ) -> dict[int, RawView]:
-    """Pose and points of each new frame as predicted; `done`: raw poses of those before."""
+    """Extract pose and points of each new frame as predicted; `done`: raw poses of earlier frames."""
     window, known, views = prediction.window, ChainMap({}, done), {}
     for row, index in enumerate(window.dense):
         if index in known:
@@ -184,9 +184,9 @@ def _raw_views(
 
 
 def _pose_after(prediction: PriorPrediction, index: int, known: Mapping[int, np.ndarray]) -> np.ndarray:
-    """Chain a pose to the last earlier frame with a pose in this prediction; that one's pose may be a placeholder.
+    """Chain a pose to the last earlier frame with a pose in this prediction, which may be a placeholder.
 
-    Without such a frame it is the pose of the frame before; NaN where the prediction has no pose of this one.
+    Without such a frame, return the pose of the previous frame; NaN if the prediction has no pose of this one.
     """
     poses = _poses(prediction)
     before = [other for other in poses if other in known and np.isfinite(poses[other]).all()]
@@ -196,7 +196,7 @@ def _pose_after(prediction: PriorPrediction, index: int, known: Mapping[int, np.
 
 
 def make_prior_query(prior: Prior, dataset: Dataset, spacing: int, window_size: int, clock: Clock) -> PriorQuery:
-    """Return a function by which a run's prior predicts both visits of a loop; the frames are read again."""
+    """Return a function with which a run's prior predicts both visits of a loop; it reads the frames again."""
 
     def query(a: int, b: int) -> JointPrediction | None:
         window = visits(a, b, spacing, window_size)

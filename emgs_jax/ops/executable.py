@@ -1,4 +1,4 @@
-"""Functions that are compiled each by itself, and the one place that says how their executables are called."""
+"""Functions that are compiled separately, and the one place that decides how their executables are called."""
 
 from collections.abc import Callable, Generator
 from contextlib import contextmanager
@@ -16,7 +16,7 @@ _call: ContextVar[Call] = ContextVar("_call", default=lambda jitted, *arguments:
 
 
 def executable(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Decorate: `eqx.filter_jit` for positional arguments, called as `calling` says."""
+    """Decorate a function: `eqx.filter_jit` for positional arguments, called through `calling`."""
     jitted = eqx.filter_jit(function)
 
     @wraps(function)
@@ -30,9 +30,9 @@ def executable(function: Callable[Arguments, Result]) -> Callable[Arguments, Res
 
 @contextmanager
 def calling(call: Call) -> Generator[None]:
-    """Inside, and in this thread, `call(jitted, *arguments)` stands for `jitted(*arguments)` of every executable.
+    """In this context and thread, replace `jitted(*arguments)` of every executable by `call(jitted, *arguments)`.
 
-    The host lists by it what a step compiles, before the first one.
+    With it the host lists what a step compiles, before the first one.
     """
     before = _call.set(call)
     try:

@@ -1,7 +1,7 @@
 """Algebra of small symmetric matrices and directions, in closed form and with stated floors.
 
-Every guard replaces the argument before the operation that would fail, never the result after it, so that gradients
-stay finite too.
+Every guard replaces the argument before an operation that would fail, never its result, so that gradients stay finite,
+too.
 """
 
 from typing import TypeAlias
@@ -11,50 +11,50 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 Entries: TypeAlias = tuple[Float[Array, "..."], ...]
-Whitening: TypeAlias = tuple[Float[Array, "n 6"], Float[Array, "n"]]  # what `whitening` gives for n covariances
+Whitening: TypeAlias = tuple[Float[Array, "n 6"], Float[Array, "n"]]  # result of `whitening` for n covariances
 
-# Below this length (m) a vector has no direction; far under any distance that is measured, far above float32's least.
+# Below this length (m) a vector has no direction; far below any measured distance, far above float32's smallest number.
 SMALLEST_LENGTH = 1e-12
-# Of a covariance's trace: what float32 loses of its entries, and the least variance that can be told from none.
+# Of a covariance's trace: rounding of its entries in float32, and the smallest variance that differs from 0.
 ROUNDED, FLATTEST = 2.0**-22, 2.0**-28
-ROUNDED_CORRELATION = 2.0**-18  # added to a diagonal of ones: what float32 loses of so few rows may make it indefinite
+ROUNDED_CORRELATION = 2.0**-18  # added to a diagonal of ones: rounding of so few rows may make it indefinite
 
 
 def safe_normalize(vectors: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
-    """Unit vectors; zero where the length is zero."""
+    """Normalise vectors to unit length; zero stays zero."""
     squared = jnp.sum(vectors * vectors, axis=-1, keepdims=True)
     is_long = squared > SMALLEST_LENGTH**2
     return jnp.where(is_long, vectors / jnp.sqrt(jnp.where(is_long, squared, 1.0)), 0.0)
 
 
 def outer(vectors: Float[Array, "*b d"]) -> Float[Array, "*b d d"]:
-    """v v'."""
+    """Compute v v'."""
     return vectors[..., :, None] * vectors[..., None, :]
 
 
 def whitening(covs: Float[Array, "*b 3 3"]) -> tuple[Float[Array, "*b 6"], Float[Array, "*b"]]:
-    """W = L⁻¹ for the Cholesky factor Σ = L L', and log|Σ|; W x has unit covariance, and |W x|² = x' Σ⁻¹ x.
+    """Compute W = L⁻¹ for the Cholesky factor Σ = L L', and log|Σ|; |W x|² = x' Σ⁻¹ x.
 
-    By the leading minors of Σ, whose terms cancel where it is flat and are summed in twice the precision. What is
-    flatter than rounding lets its entries tell counts as that flat, a ratio of widths of some ten thousand.
+    Uses the leading minors of Σ. Their terms cancel if Σ is flat, so they are summed in twice the precision. Flatness
+    is limited to what rounding of the entries can represent, a ratio of widths of some ten thousand.
 
     Returns:
-        The lower triangle of W, row by row, and the log-determinant; those of the identity where a variance is negative
-        or none is positive.
+        The lower triangle of W, row by row, and the log-determinant; those of the identity if a variance is negative or
+        none is positive.
     """
     entries, logdet = whitened_entries(lower_entries(covs))
     return jnp.stack(entries, axis=-1), logdet
 
 
 def lower_entries(matrices: Float[Array, "*b 3 3"]) -> Entries:
-    """The lower triangles of 3×3 matrices, row by row, entry by entry."""
-    # Transposed first, or XLA takes each entry out of its matrix wherever it occurs: four times as slow on a CPU.
+    """Take the lower triangles of 3×3 matrices, row by row, entry by entry."""
+    # Transpose first; otherwise XLA extracts each entry wherever it occurs, four times as slow on a CPU.
     entries = jnp.unstack(matrices.reshape(*matrices.shape[:-2], 9), axis=-1)
     return tuple(jnp.copy(entries[place]) for place in (0, 3, 4, 6, 7, 8))
 
 
 def whitened_entries(lower: Entries) -> tuple[Entries, Float[Array, "..."]]:
-    """`whitening` of lower triangles, entry by entry."""
+    """Compute `whitening` of lower triangles, entry by entry."""
     trace = lower[0] + lower[2] + lower[5]
     # A power of two, which rounds no entry.
     scale = jax.lax.stop_gradient(jax.lax.reduce_precision(jnp.where(trace > 0, trace, 1.0), 8, 0))
@@ -78,7 +78,7 @@ def whitened_entries(lower: Entries) -> tuple[Entries, Float[Array, "..."]]:
 
 
 def two_product(first: Float[Array, "*b"], second: Float[Array, "*b"]) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
-    """A product, and what its rounding loses (Dekker 1971); that has no gradient."""
+    """Compute a product and its rounding error (Dekker 1971); the error has no gradient."""
     product = first * second
     high, other_high = (jax.lax.reduce_precision(x, exponent_bits=8, mantissa_bits=11) for x in (first, second))
     low, other_low = first - high, second - other_high
@@ -87,7 +87,7 @@ def two_product(first: Float[Array, "*b"], second: Float[Array, "*b"]) -> tuple[
 
 
 def two_sum(first: Float[Array, "*b"], second: Float[Array, "*b"]) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
-    """A sum, and what its rounding loses (Knuth); that has no gradient."""
+    """Compute a sum and its rounding error (Knuth); the error has no gradient."""
     total = first + second
     part = total - first
     return total, jax.lax.stop_gradient((first - (total - part)) + (second - part))
@@ -96,20 +96,20 @@ def two_sum(first: Float[Array, "*b"], second: Float[Array, "*b"]) -> tuple[Floa
 def minor_2x2(
     a: Float[Array, "*b"], b: Float[Array, "*b"], c: Float[Array, "*b"], d: Float[Array, "*b"]
 ) -> tuple[Float[Array, "*b"], Float[Array, "*b"]]:
-    """a b - c d as a sum of two numbers, in twice the precision."""
+    """Compute a b - c d as a sum of two numbers, in twice the precision."""
     (one, lost), (other, more) = two_product(a, b), two_product(-c, d)
     total, rest = two_sum(one, other)
     return total, rest + lost + more
 
 
 def floored(covs: Float[Array, "*b 3 3"], min_std: Float[Array, ""]) -> Float[Array, "*b 3 3"]:
-    """Σ + σ² I with σ² = min_std², or what keeps a very wide Σ positive where its entries are rounded."""
+    """Add a floor: Σ + σ² I with σ² = min_std², or more if a very wide Σ needs it to stay positive despite rounding."""
     trace = jnp.trace(covs, axis1=-2, axis2=-1)
     return covs + (min_std**2 + ROUNDED * trace)[..., None, None] * jnp.eye(3)
 
 
 def inverse_2x2(matrices: Float[Array, "*b 2 2"]) -> Float[Array, "*b 2 2"]:
-    """Inverse of symmetric positive 2×2 matrices; zero where the determinant is not positive."""
+    """Invert symmetric positive 2×2 matrices; zero if the determinant is not positive."""
     a, b, c = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]
     det, rest = minor_2x2(a, c, b, b)
     det += rest
@@ -119,63 +119,63 @@ def inverse_2x2(matrices: Float[Array, "*b 2 2"]) -> Float[Array, "*b 2 2"]:
 
 
 def mahalanobis_sq(offsets: Float[Array, "*#b d"], precisions: Float[Array, "*#b d d"]) -> Float[Array, "*b"]:
-    """Squared Mahalanobis distance d' P d, never negative."""
+    """Compute the squared Mahalanobis distance d' P d, never negative."""
     return jnp.maximum(jnp.einsum("...i,...ij,...j->...", offsets, precisions, offsets), 0.0)
 
 
-# Vectors as tuples of their entries. Products of many 3-vectors are then one pass over all of them with the gathers
-# inside, on a CPU about eight times as fast as `einsum` on gathered rows.
+# Vectors as tuples of their entries: products of many 3-vectors are then one pass that includes the gathers, on a CPU
+# about eight times as fast as `einsum` on gathered rows.
 
 
 def gather_entries(table: Float[Array, "n c"], rows: Int[Array, "*b"]) -> Entries:
-    """table[rows], entry by entry."""
+    """Gather table[rows], entry by entry."""
     return tuple(column[rows] for column in jnp.unstack(table, axis=-1))
 
 
 def gather_offsets(points: Float[Array, "m d"], table: Float[Array, "n d"], rows: Int[Array, "m k"]) -> Entries:
-    """points[:, None] - table[rows], entry by entry."""
+    """Compute points[:, None] - table[rows], entry by entry."""
     entries = jnp.unstack(points[:, None], axis=-1)
     return tuple(a - b for a, b in zip(entries, gather_entries(table, rows), strict=True))
 
 
 def down(vectors: Float[Array, "b q d"]) -> Entries:
-    """Vectors of a block's q queries entry by entry, to meet the c vectors of `across`."""
+    """Arrange the vectors of a block's q queries, entry by entry, to broadcast against the c of `across`."""
     return tuple(entry[:, :, None] for entry in jnp.unstack(vectors, axis=-1))
 
 
 def across(vectors: Float[Array, "b c d"]) -> Entries:
-    """Vectors of the c things near a block, likewise."""
+    """Arrange the vectors of c items near a block, to broadcast against those of `down`."""
     return tuple(entry[:, None] for entry in jnp.unstack(vectors, axis=-1))
 
 
 def between(first: Float[Array, "b q d"], second: Float[Array, "b c d"]) -> Entries:
-    """first - second for every pair within each block, entry by entry."""
+    """Compute first - second for every pair within each block, entry by entry."""
     return tuple(a - b for a, b in zip(down(first), across(second), strict=True))
 
 
 def dot(first: Entries, second: Entries) -> Float[Array, "..."]:
-    """Inner product."""
+    """Compute the inner product."""
     return sum((a * b for a, b in zip(first, second, strict=True)), start=jnp.zeros(()))
 
 
 def cross(first: Entries, second: Entries) -> Entries:
-    """Cross product."""
+    """Compute the cross product."""
     (a, b, c), (x, y, z) = first, second
     return b * z - c * y, c * x - a * z, a * y - b * x
 
 
 def whiten(triangle: Entries, vector: Entries) -> Entries:
-    """W x, for the triangle of `whitening`."""
+    """Compute W x, for the triangle of `whitening`."""
     a, b, c, d, e, f = triangle
     x, y, z = vector
     return a * x, b * x + c * y, d * x + e * y + f * z
 
 
 def widened_distance_sq(white: Entries, noise: Entries) -> tuple[Float[Array, "..."], Float[Array, "..."]]:
-    """Squared Mahalanobis distance under Σ + ν ν' and log|Σ + ν ν'| - log|Σ|, of whitened offsets w and noise u.
+    """Compute the squared Mahalanobis distance under Σ + ν ν', and log|Σ + ν ν'| - log|Σ|, from whitened w and u = W ν.
 
-    (|w|² + |w × u|²) / (1 + |u|²), in which nothing cancels as it does in |w|² - (w·u)² / (1 + |u|²) (Sherman–Morrison)
-    where something distant lies behind its Gaussian along ν.
+    (|w|² + |w × u|²) / (1 + |u|²) has no cancellation, unlike |w|² - (w·u)² / (1 + |u|²) (Sherman–Morrison) for a
+    distant point behind its Gaussian along ν.
     """
     growth = 1.0 + dot(noise, noise)
     turned = cross(white, tuple(entry / jnp.sqrt(growth) for entry in noise))
@@ -183,14 +183,14 @@ def widened_distance_sq(white: Entries, noise: Entries) -> tuple[Float[Array, ".
 
 
 def quadratic(lower: Entries, vector: Entries) -> Float[Array, "..."]:
-    """x' Σ x, for the lower triangle of Σ."""
+    """Compute x' Σ x, for the lower triangle of Σ."""
     a, b, c, d, e, f = lower
     x, y, z = vector
     return a * x * x + c * y * y + f * z * z + 2.0 * (b * x * y + d * x * z + e * y * z)
 
 
 def widen(white: Entries, noise: Entries) -> Entries:
-    """A whitened offset W x made white for the covariance Σ + ν ν', where `noise` is W ν.
+    """Whiten an offset W x further, for the covariance Σ + ν ν', where `noise` is W ν.
 
     (I + u u')^(-1/2) = I - u u' / (s (s + 1)) with s² = 1 + u'u.
     """
@@ -200,7 +200,7 @@ def widen(white: Entries, noise: Entries) -> Entries:
 
 
 def tangent_basis(normals: Float[Array, "*b 3"]) -> Float[Array, "*b 3 2"]:
-    """Two unit vectors orthogonal to unit `normals` and to each other, without a singular direction but -z.
+    """Make two unit vectors orthogonal to unit `normals` and to each other; singular only at -z.
 
     Source: Duff et al., "Building an orthonormal basis, revisited", JCGT 2017.
     """
@@ -214,7 +214,7 @@ def tangent_basis(normals: Float[Array, "*b 3"]) -> Float[Array, "*b 3 2"]:
 
 
 def principal_axes_2x2(matrices: Float[Array, "*b 2 2"]) -> Float[Array, "*b 2 2"]:
-    """Orthonormal eigenvectors as columns, larger eigenvalue first; the coordinate axes for a multiple of I."""
+    """Compute orthonormal eigenvectors as columns, larger eigenvalue first; the coordinate axes for a multiple of I."""
     a, b, c = matrices[..., 0, 0], matrices[..., 0, 1], matrices[..., 1, 1]
     is_isotropic = (jnp.abs(b) + jnp.abs(a - c)) <= 0
     angle = 0.5 * jnp.arctan2(jnp.where(is_isotropic, 0.0, 2.0 * b), jnp.where(is_isotropic, 1.0, a - c))

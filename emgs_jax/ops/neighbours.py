@@ -1,8 +1,8 @@
 """Nearest neighbours and compaction with static shapes.
 
-Neighbours are looked for by blocks: queries that are near each other share a list of the points that are nearest to any
-of them, and choose among these. Everything is a few large operations on dense arrays, with one small sort for each set
-of positions, which suits a GPU and the vector units of a CPU alike.
+Queries are searched in blocks: queries near each other share a list of the points nearest to any of them, and choose
+from it. All is a few large operations on dense arrays, with one small sort for each set of positions. That suits GPUs
+and the vector units of CPUs alike.
 """
 
 import equinox as eqx
@@ -15,25 +15,25 @@ from emgs_jax.ops.pytree import fill_rows, join_rows, split_rows
 from emgs_jax.ops.ranges import MAX_LENGTH_M
 
 GROUP = 16  # points per group: near each other
-NUM_GROUPS = 24  # groups that a block of queries looks into
+NUM_GROUPS = 24  # groups that a block of queries searches
 BLOCK = 8  # queries of a block of `knn`
-LEAST_LISTED = 32  # points near a block of queries, of which six times as many as are wanted
-RANKED = 12  # values that are compared with all others at once
+LEAST_LISTED = 32  # smallest list of a block; by default it has six times as many points as wanted
+RANKED = 12  # values compared with all others at once
 CURVE_BITS = 10  # per axis, of the cells of the Hilbert curve
-NUM_SAMPLED = 64  # positions by whose gaps those cells are laid
-WIDE_GAP = 16.0  # of the usual one; wider ones between positions are cut to that
-FAR = 1e18  # m; where what does not count stands: its squared distance is finite, and larger than any other
-FAR_SQ = 0.5 * FAR**2  # m²; less is the distance of two that count
-MAX_BLOCKS = 4096  # which are compared with their groups at once; more are done one part after the other
+NUM_SAMPLED = 64  # positions whose gaps determine these cells
+WIDE_GAP = 16.0  # times the usual gap; wider gaps between positions are cut to this
+FAR = 1e18  # m; position of points that do not count: their squared distance is finite and larger than any other
+FAR_SQ = 0.5 * FAR**2  # m²; a smaller squared distance is of two points that count
+MAX_BLOCKS = 4096  # compared with their groups at once; more are done in parts
 
 
 class Groups(eqx.Module):
-    """Points along a space-filling curve, so that every GROUP consecutive ones are near each other.
+    """Points sorted along a space-filling curve, so that every GROUP consecutive ones are near each other.
 
     Args:
-        positions: of the members, coordinate by coordinate; FAR where there is none.
-        rows: of the members in the array that they come from.
-        low, high: corners of the box round each group.
+        positions: of the members, coordinate by coordinate; FAR for empty slots.
+        rows: of the members in the original array.
+        low, high: corners of each group's bounding box.
     """
 
     positions: Float[Array, "g d p"]
@@ -46,10 +46,10 @@ class Nearby(eqx.Module):
     """Nearest points of each block of queries.
 
     Args:
-        queries: rows of the queries of a block; one past the last for unused slots of a block.
+        queries: rows of a block's queries; one past the last row for unused slots.
         rows: of the points that are nearest to any query of the block, nearest first.
         exists: False for slots without a point.
-        beyond_sq: no other point is nearer to a query of the block than that, m².
+        beyond_sq: m²; no other point is nearer to a query of the block.
     """
 
     queries: Int[Array, "b q"]
@@ -59,26 +59,26 @@ class Nearby(eqx.Module):
 
 
 def is_within_reach(positions: Float[Array, "*m d"]) -> Bool[Array, "*m"]:
-    """Positions that are finite, and along each axis within what a map can hold."""
+    """Tell which positions are finite and within the range of a map along each axis."""
     return jnp.all(jnp.abs(positions) < MAX_LENGTH_M, axis=-1)
 
 
 def curve_order(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> Int[Array, "m"]:
-    """Rows along the Hilbert curve through those that count; the others come last."""
+    """Sort rows along the Hilbert curve through the positions that count; the others come last."""
     number = _curve(_cells(positions, counts))
     return jnp.argsort(jnp.where(counts, number, jnp.iinfo(jnp.int32).max))
 
 
 def _cells(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> tuple[Int[Array, "m"], ...]:
-    """Cells along each axis, axis by axis, of one size but where nothing is.
+    """Assign cells along each axis, of equal size except in empty space.
 
-    Some positions tell the gaps along an axis. One that is much wider than most is cut, so that a point far away, or
-    another room, leaves the cells of the others as small as they were.
+    A sample of positions gives the gaps along an axis. A gap that is much wider than most is shortened, so that a point
+    far away, or another room, does not enlarge the cells of the others.
     """
     low = jnp.min(jnp.where(counts[:, None], positions, jnp.inf), axis=0)
     high = jnp.max(jnp.where(counts[:, None], positions, -jnp.inf), axis=0)
     place = jnp.cumsum(counts)
-    # Multiples of the golden section: no stride that rows of pixels may have, too.
+    # Multiples of the golden section, to match no stride of pixel rows.
     wanted = jnp.floor(jnp.mod(0.618034 * jnp.arange(NUM_SAMPLED), 1.0) * place[-1])
     rows = jnp.searchsorted(place, wanted.astype(place.dtype), side="right")
     some = jnp.take(positions, rows, axis=0, mode="clip")
@@ -89,14 +89,14 @@ def _cells(positions: Float[Array, "m d"], counts: Bool[Array, "m"]) -> tuple[In
     ends = jnp.concatenate([jnp.zeros_like(cut[:1]), jnp.cumsum(cut, axis=0)])
     size = jnp.max(ends)
     unit = 2**CURVE_BITS / jnp.where((size > 0) & jnp.isfinite(size), size, 1.0)
-    # One axis after the other, or XLA looks all of them up for each again.
+    # One axis after the other; otherwise XLA looks all of them up again for each.
     scaled = (unit * jnp.interp(*axis) for axis in zip(positions.T, known.T, ends.T, strict=True))
     last = 2**CURVE_BITS - 1
     return tuple(jnp.clip(jnp.where(jnp.isfinite(x), x, 0.0), 0, last).astype(jnp.int32) for x in scaled)
 
 
 def group_points(points: Float[Array, "n d"], valid: Bool[Array, "n"], order: Int[Array, "n"] | None = None) -> Groups:
-    """Groups of the valid points along `order`; None: along the curve."""
+    """Group the valid points along `order`; None: along the curve."""
     points = jax.lax.stop_gradient(points)  # a row number has no gradient
     valid &= is_within_reach(points)
     order = curve_order(points, valid) if order is None else order
@@ -108,7 +108,7 @@ def group_points(points: Float[Array, "n d"], valid: Bool[Array, "n"], order: In
 
 
 def order_of(groups: Groups, num_points: int) -> Int[Array, "n"]:
-    """The order of the points that were grouped: for a search of the same points among themselves."""
+    """Return the order of the grouped points, for a search of the same points among themselves."""
     return groups.rows.reshape(-1)[:num_points]
 
 
@@ -120,13 +120,13 @@ def nearby(
     size: int,
     order: Int[Array, "m"] | None = None,
 ) -> Nearby:
-    """The `count` points nearest to any query of each block, of those in the groups whose boxes are nearest to one.
+    """List the `count` points nearest to any query of each block, among the groups with the nearest boxes.
 
     Args:
-        asked: those that count; one that is not within reach never does.
-        count: length of the list, static; not more than NUM_GROUPS groups hold.
+        asked: queries that count; one that is not within reach never does.
+        count: length of the list, static; at most the points of NUM_GROUPS groups.
         size: queries of a block, static.
-        order: of the queries, `size` consecutive ones are a block; None: along the curve.
+        order: of the queries; `size` consecutive ones are a block; None: along the curve.
     """
     queries, groups = jax.lax.stop_gradient((queries, groups))
     asked &= is_within_reach(queries)
@@ -143,31 +143,31 @@ def nearby(
 def _nearest_to_any(
     blocks: Float[Array, "b q d"], counts: Bool[Array, "b q"], groups: Groups, count: int
 ) -> tuple[Int[Array, "b c"], Bool[Array, "b c"], Float[Array, "b"]]:
-    """`nearby` for blocks as they are; a query that does not count is at -FAR."""
+    """Do `nearby` for given blocks; a query that does not count is at -FAR."""
     gap_sq = _distance_to_boxes_sq(blocks, groups)
     num_groups = min(max(NUM_GROUPS, -(-count // GROUP)), groups.rows.shape[0])
     negative, near = jax.lax.top_k(-gap_sq, num_groups)
-    # The least of what `top_k` gives, not its last column: XLA makes a whole sort of one that is sliced.
+    # The minimum of `top_k`'s result, not its last column: XLA sorts everything if the result is sliced.
     beyond_sq = -jnp.min(negative, axis=1)
-    if num_groups == groups.rows.shape[0]:  # it looks into all of them
+    if num_groups == groups.rows.shape[0]:  # search all of them
         beyond_sq = jnp.full_like(beyond_sq, jnp.inf)
     members = [values[near].reshape(near.shape[0], -1) for values in jnp.unstack(groups.positions, axis=1)]
-    # One query and one coordinate after the other: sums over short axes would not fill the vectors of a CPU.
+    # One query and one coordinate at a time: sums over short axes do not fill a CPU's vector units.
     nearest_sq = jnp.full(members[0].shape, jnp.inf)
     for query in jnp.unstack(blocks, axis=1):
         offsets = tuple(x[:, None] - y for x, y in zip(jnp.unstack(query, axis=-1), members, strict=True))
         nearest_sq = jnp.minimum(nearest_sq, dot(offsets, offsets))
     negative, best = jax.lax.top_k(-nearest_sq, count)
     rows = groups.rows[jnp.take_along_axis(near, best // GROUP, axis=1), best % GROUP]
-    if count < nearest_sq.shape[1]:  # what is nearby beside the list
+    if count < nearest_sq.shape[1]:  # points nearby that are not in the list
         beyond_sq = jnp.minimum(beyond_sq, -jnp.min(negative, axis=1))
     return rows, negative > -FAR_SQ, beyond_sq
 
 
 def _distance_to_boxes_sq(blocks: Float[Array, "b q d"], groups: Groups) -> Float[Array, "b g"]:
-    """Squared distance of the boxes of the groups to the nearest query of each block.
+    """Compute the squared distance of the groups' boxes to the nearest query of each block.
 
-    Not to the box round the block: queries that are far apart would have much of all between them, and none near.
+    Not to the block's own box: for queries that are far apart it would contain many groups, none of them near.
     """
     corners = tuple(zip(jnp.unstack(groups.low, axis=-1), jnp.unstack(groups.high, axis=-1), strict=True))
     nearest_sq = jnp.full((blocks.shape[0], groups.rows.shape[0]), jnp.inf)
@@ -179,12 +179,12 @@ def _distance_to_boxes_sq(blocks: Float[Array, "b q d"], groups: Groups) -> Floa
 
 
 def of_queries(near: Nearby, values: Shaped[Array, "b q *v"], num_queries: int) -> Shaped[Array, "m *v"]:
-    """Values of the queries of all blocks in the order of the queries."""
+    """Reorder values from blocks to the order of the queries."""
     return jnp.zeros((num_queries, *values.shape[2:]), values.dtype).at[near.queries].set(values, mode="drop")
 
 
 def among_nearest(distance_sq: Float[Array, "*b c"], exists: Bool[Array, "*#b c"], k: int) -> Bool[Array, "*b c"]:
-    """Mark the k nearest of those of c points that exist."""
+    """Mark the k nearest of the existing points among c."""
     return exists & (ranks(jnp.where(exists, distance_sq, jnp.inf)) < k)
 
 
@@ -198,12 +198,12 @@ def nearest(
     count: int = 0,
     order: Int[Array, "m"] | None = None,
 ) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
-    """The k nearest points of every query among those `nearby` its block, nearest first.
+    """Find the k nearest points of every query among those `nearby` its block, nearest first.
 
-    For positions on surfaces that is nearly always those of `knn`: the farthest of the k may be missed.
+    For positions on surfaces the result is nearly always that of `knn`; the farthest of the k may be missed.
 
     Args:
-        asked: those that count; the others may have any answer or none.
+        asked: queries that count; the others may have any answer or none.
         size: queries of a block, static.
         count: length of a block's list; by default 6 k, at least 32.
         order: of the queries; None: along the curve.
@@ -222,17 +222,17 @@ def knn(
     k: int,
     asked: Bool[Array, "m"] | None = None,
 ) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
-    """The k nearest valid points of every query, nearest first, exactly.
+    """Find the k nearest valid points of every query, nearest first, exactly.
 
-    As `nearest`, but a block whose list may lack one of them is compared with all points, one block after the other.
+    Like `nearest`, but a block whose list may lack one of them is compared with all points, one block at a time.
 
     Args:
         k: number of neighbours, static; at most n.
         asked: queries that need an answer, None for all.
 
     Returns:
-        Row numbers into `points`, and which of them exist: False where fewer than k points are valid. A query that is
-        not asked may have any or none.
+        Row numbers into `points`, and which of them exist: False if fewer than k points are valid. A query that does
+        not count may have any or none.
     """
     queries, points = jax.lax.stop_gradient((queries, points))  # a row number has no gradient
     asked = jnp.ones(queries.shape[0], bool) if asked is None else asked
@@ -264,7 +264,7 @@ def _ranked(
     count: int,
     order: Int[Array, "m"] | None,
 ) -> tuple[Nearby, Float[Array, "b q c"], Int[Array, "b q c"]]:
-    """Find the points near each block, with squared distance and rank of each of them for every query of the block."""
+    """Find the points near each block, with their squared distance and rank for every query of the block."""
     queries, points = jax.lax.stop_gradient((queries, points))
     near = nearby(queries, asked, groups, count, size, order)
     blocks = queries.at[near.queries].get(mode="clip")
@@ -276,26 +276,26 @@ def _ranked(
 def _first(
     near: Nearby, distance_sq: Float[Array, "b q c"], rank: Int[Array, "b q c"], k: int, num_queries: int
 ) -> Int[Array, "m k"]:
-    """Rows of the k that rank first, in the order of the queries; -1 where there is none."""
+    """Return the rows of the first k ranks, in the order of the queries; -1 for none."""
     rows = jnp.where(distance_sq < FAR_SQ, near.rows[:, None], -1)
-    # Each row goes to its query and rank; what comes after the k nearest falls off the end.
+    # Each row goes to its query and rank; ranks beyond k fall off the end.
     return jnp.full((num_queries, k), -1, rows.dtype).at[near.queries[..., None], rank].set(rows, mode="drop")
 
 
 def _existing(found: Int[Array, "m k"]) -> tuple[Int[Array, "m k"], Bool[Array, "m k"]]:
-    """Row numbers, and which of them exist; else row 0."""
+    """Split into row numbers and which of them exist; row 0 for the others."""
     return jnp.maximum(found, 0), found >= 0
 
 
 def ranks(values: Float[Array, "*b c"]) -> Int[Array, "*b c"]:
-    """Rank c values that are not negative: 0 for the smallest; no two have the same rank.
+    """Rank c values that are not negative: 0 for the smallest; no two share a rank.
 
-    A few values at a time are compared with all: operations on whole vectors instead of a sort of each row, in a loop,
-    or XLA would repeat them for every consumer of the ranks. Values that differ by less than c · 2⁻²³ of themselves
-    count as equal; of these the first comes first.
+    A few values at a time are compared with all: whole-vector operations instead of a sort of each row. They run in a
+    loop; otherwise XLA would repeat them for every use of the ranks. Values that differ by less than c · 2⁻²³ of
+    themselves count as equal and keep their order.
     """
     num = values.shape[-1]
-    # Not negative floats are ordered as their bits are, the last of which carry the place.
+    # Floats that are not negative sort like their bits; the last bits hold the position.
     place_bits = (1 << (num - 1).bit_length()) - 1
     keys = (jax.lax.bitcast_convert_type(values, jnp.int32) & ~place_bits) | jnp.arange(num)
     others = jnp.pad(keys, [(0, 0)] * (keys.ndim - 1) + [(0, -num % RANKED)], constant_values=jnp.iinfo(jnp.int32).max)
@@ -308,13 +308,13 @@ def ranks(values: Float[Array, "*b c"]) -> Int[Array, "*b c"]:
 
 
 def _curve(cells: tuple[Int[Array, "m"], ...]) -> Int[Array, "m"]:
-    """Number of every cell along the Hilbert curve.
+    """Number every cell along the Hilbert curve.
 
-    Source: Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707, 2004. Consecutive cells touch, so that
-    groups are compact: a search takes an eighth less time than along the Z curve.
+    Source: Skilling, "Programming the Hilbert curve", AIP Conf. Proc. 707, 2004. Consecutive cells touch, so groups are
+    compact: a search takes an eighth less time than along the Z curve.
     """
     axes = list(cells)
-    for bit in range(CURVE_BITS - 1, 0, -1):  # undo the turns of every cube, from the largest on
+    for bit in range(CURVE_BITS - 1, 0, -1):  # undo the rotations of every cube, from the largest on
         lower = (1 << bit) - 1
         for number, axis in enumerate(axes):
             is_upper = (axis >> bit) & 1 > 0
@@ -334,10 +334,10 @@ def _curve(cells: tuple[Int[Array, "m"], ...]) -> Int[Array, "m"]:
 
 
 def compact_rows(mask: Bool[Array, "n"], capacity: int) -> tuple[Int[Array, "c"], Bool[Array, "c"], Int[Array, ""]]:
-    """Row numbers of the first `capacity` True entries, in order.
+    """Find the row numbers of the first `capacity` True entries, in order.
 
     Returns:
-        The rows (n where there is none, which `put_rows` drops), which of them exist, and how many did not fit.
+        The rows (n for empty slots, which `put_rows` drops), which of them exist, and how many did not fit.
     """
     count = jnp.sum(mask)
     places = jnp.where(mask, jnp.cumsum(mask) - 1, capacity)

@@ -1,4 +1,4 @@
-"""Matrix products in full float32 wherever they run."""
+"""Matrix products in full float32 on every device."""
 
 from collections.abc import Callable
 from functools import wraps
@@ -11,10 +11,10 @@ Result = TypeVar("Result")
 
 
 def full_precision(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
-    """Decorate: the factors of matrix products inside are not rounded.
+    """Decorate a function so that the factors of its matrix products are not rounded.
 
-    By default JAX rounds them to ten bits (TF32) on recent GPUs, which is millimetres for a distant point. Every public
-    function with such products asks for itself, so that importing the package changes nothing for other code.
+    By default JAX rounds them to ten bits (TF32) on recent GPUs, which means millimetres for a distant point. Every
+    public function with such products has this decorator, so importing the package changes nothing for other code.
     """
 
     @wraps(function)

@@ -15,17 +15,17 @@ Tree = TypeVar("Tree")
 
 
 def _as_float32(value: Any) -> Any:
-    # Without the conversion, YAML's `1` and `1.0` would be two dtypes and hence two compilations.
+    # Without the conversion, YAML's `1` and `1.0` would be two dtypes, and so two compilations.
     return value if isinstance(value, jax.ShapeDtypeStruct) else jnp.asarray(value, jnp.float32)
 
 
 def traced(default: Any = MISSING, low: float | int | None = None, high: float | int | None = None) -> Any:
-    """A config field that is a number of the computation: changing it compiles nothing. `ops.ranges` has its ends."""
+    """Declare a config field that is a traced number: changing it compiles nothing. Its range is as in `ops.ranges`."""
     return eqx.field(default=default, converter=_as_float32, metadata=ranged(low, high))
 
 
 def choice(*names: str) -> Any:
-    """A traced config field, written as one of `names` and held as its position, so that readings can be swept."""
+    """Declare a traced config field, written as one of `names` and held as its index, so that readings can be swept."""
 
     def convert(value: Any) -> Any:
         return _as_float32(names.index(_one_of(names, value)) if isinstance(value, str) else value)
@@ -34,7 +34,7 @@ def choice(*names: str) -> Any:
 
 
 def static_choice(*names: str, default: Any = MISSING) -> Any:
-    """A config field that is one of `names`, a choice of code: each compiles once."""
+    """Declare a config field that chooses code, one of `names`: each compiles once."""
     return eqx.field(
         default=default, static=True, converter=lambda value: _one_of(names, value), metadata={"choices": names}
     )
@@ -47,12 +47,12 @@ def _one_of(names: Sequence[str], value: Any) -> str:
 
 
 def static(default: Any = MISSING, low: float | int | None = None, high: float | int | None = None) -> Any:
-    """A config field that is a shape, a loop bound or a choice of code: each value compiles once."""
+    """Declare a config field that is a shape, a loop bound or a choice of code: each value compiles once."""
     return eqx.field(default=default, static=True, metadata=ranged(low, high))
 
 
 def take_rows(tree: Tree, rows: Int[Array, "*r"]) -> Tree:
-    """Rows of every leaf; a row number past the end gives the last row, to be masked by the caller."""
+    """Take rows of every leaf; a row number past the end gives the last row, which the caller must mask."""
     return jax.tree.map(lambda leaf: jnp.take(leaf, rows, axis=0, mode="clip"), tree)
 
 
@@ -76,15 +76,15 @@ def stack(trees: Sequence[Tree]) -> PyTree:
 
 
 def fill_rows(array: Shaped[Array, "n *c"], multiple: int, value: float | int) -> Shaped[Array, "m *c"]:
-    """Rows of `value` after the last, up to the next multiple of `multiple` rows."""
+    """Append rows of `value` up to the next multiple of `multiple` rows."""
     beyond = ((0, -array.shape[0] % multiple), *[(0, 0)] * (array.ndim - 1))
     return jnp.pad(array, beyond, constant_values=value)
 
 
 def split_rows(tree: Tree, max_rows: int) -> Tree:
-    """Cut the first axis of every leaf into equal parts of at most `max_rows`, a new first axis; zeros fill the last.
+    """Split the first axis of every leaf into equal parts of at most `max_rows`, a new first axis; zeros fill the last.
 
-    What a stage computes in between for one part stays in a CPU's cache; `join_rows` undoes it.
+    Intermediate results of one part then fit into a CPU's cache. `join_rows` undoes it.
     """
     num_rows = jax.tree.leaves(tree)[0].shape[0]
     num_parts = max(-(-num_rows // max_rows), 1)
@@ -97,5 +97,5 @@ def split_rows(tree: Tree, max_rows: int) -> Tree:
 
 
 def join_rows(tree: Tree, num_rows: int) -> Tree:
-    """The first `num_rows` rows of the parts of `split_rows`, one after the other."""
+    """Join the parts of `split_rows` and keep the first `num_rows` rows."""
     return jax.tree.map(lambda leaf: leaf.reshape(-1, *leaf.shape[2:])[:num_rows], tree)

@@ -1,1 +1,1 @@
-"""Appearance by gradient descent: splats of the pixels' resolution on the map's surface, fitted to the images."""
+"""Appearance by gradient descent: fit splats at pixel resolution, on the map's surface, to the images."""

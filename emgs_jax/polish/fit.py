@@ -1,4 +1,4 @@
-"""The fit of splats, and of poses, to the frames: Adam, one frame a step, in an order that the seed says."""
+"""Fit splats and poses to the frames: Adam, one frame a step, in an order given by the seed."""
 
 import hashlib
 from collections.abc import Callable
@@ -21,13 +21,13 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.ranges import number
 from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, Shot, initial, loss
 
-POSE_RATE = 0.3  # Adam's for frames that are placed on finished splats, in standard deviations
+POSE_RATE = 0.3  # Adam's learning rate for frames placed on finished splats, in standard deviations
 Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Adam's learning rate of each part of `Appearance`, and of the poses in standard deviations of each."""
+    """Adam's learning rates for each part of `Appearance`, and for the poses, in standard deviations of each."""
 
     colors: float = number(0.03, low=0, high=10)
     logit: float = number(0.05, low=0, high=10)
@@ -39,24 +39,23 @@ class Rates:
 
 @dataclass(frozen=True)
 class PolishConfig:
-    """Settings of splats: how they are made and fitted.
+    """How splats are made and fitted.
 
     Args:
-        pixels_per_splat: of the frame that makes it.
-        held_out_every: every so many-th frame is never fitted, the first one included.
+        pixels_per_splat: pixels per splat in the frame that makes it.
+        held_out_every: every such frame is never fitted, beginning with the first one.
         steps: of Adam, one frame each.
-        final_rate: of the learning rates, at the last step; exponentially from 1.
-        opacity: of a splat when it begins.
-        min_opacity: what has less at the end is left out.
-        every: steps after which a stopped fit goes on from there.
+        final_rate: factor on the learning rates at the last step; they decay exponentially.
+        opacity: initial opacity of a splat.
+        min_opacity: splats below this at the end are removed.
+        every: steps between the states from which a stopped fit resumes.
         seed: of the order of the frames.
-        exposures: share of a frame's brightness beside its splats' that is its own gain, in logarithms; 0: all frames
-            have the same. With all of it, gains and colours drift, one against the other.
-        poses: whether the poses of the fitted frames are fitted, too; those of the others are then placed on the
-            splats, which stay.
-        pose_steps: of Adam, for each of these.
+        exposures: share of the log-ratio between a frame's brightness and its splats' that becomes its own gain; 0: all
+            frames have the same. With 1, gains and colours drift against each other.
+        poses: fit the poses of the fitted frames, too; the others are then placed on the finished splats.
+        pose_steps: of Adam, for each frame that is placed on finished splats.
         rates: learning rates.
-        loss: its weights.
+        loss: weights of the loss.
     """
 
     rates: Rates = field(default_factory=Rates)
@@ -75,18 +74,18 @@ class PolishConfig:
 
 
 def is_held_out(row: int, config: PolishConfig) -> bool:
-    """Test whether the frame of this row is kept from the fit, for the comparison."""
+    """Test whether the frame of this row is held out for the comparison."""
     return row % config.held_out_every == 0
 
 
 class Views(NamedTuple):
-    """Frames that splats are fitted to, or that are placed on them.
+    """Frames to which splats are fitted, or that are placed on them.
 
     Args:
-        targets: `loss`'s of each frame, (h, w, 4).
+        targets: `Shot.target` of each frame, (h, w, 4).
         poses: T_world_camera of each, (m, 4, 4).
-        spreads: (m, 6, 6); a pose may become T Exp(spread u), 0 for one that stays.
-        gains: `Shot`'s of each, (m, 3), where a fit begins.
+        spreads: (m, 6, 6); a pose may become T Exp(spread u); 0 for a fixed pose.
+        gains: initial `Shot.gain` of each, (m, 3).
     """
 
     targets: Spool
@@ -96,13 +95,13 @@ class Views(NamedTuple):
 
 
 class State(NamedTuple):
-    """State of a fit: what it has found, and Adam's moments."""
+    """State of a fit: parameters and Adam's moments."""
 
     fitted: Appearance
     offsets: Float[Array, "m 6"]  # of the poses, in spreads
     gains: Float[Array, "m 3"]  # of each frame, when it was last seen
     moments: Any
-    pose_moments: Any  # of each frame by itself, as one is seen in a step
+    pose_moments: Any  # of each frame separately, as a step sees one frame
 
 
 def fit(
@@ -114,16 +113,16 @@ def fit(
     path: Path,
     on_step: Callable[[int, float], None] = lambda step, psnr: None,
 ) -> tuple[Appearance, Views]:
-    """Fit the splats' appearance to frames; the same call goes on where one that was stopped had written `path`.
+    """Fit the splats' appearance to frames; the same call resumes a stopped fit from `path`.
 
     Args:
-        anchors: where the splats begin.
-        colors: (n, 3), likewise.
-        path: of what a stopped fit goes on from; gone at the end.
-        on_step: told the number of each step, and the PSNR (dB) of its frame before it.
+        anchors: initial splats.
+        colors: initial colours, (n, 3).
+        path: of the file from which a stopped fit resumes; removed at the end.
+        on_step: called with the number of each step, and the PSNR (dB) of its frame before it.
 
     Returns:
-        The splats' appearance, and the frames where they are now, with the gains that they turned out to have.
+        The splats' appearance, and the frames with their fitted poses and gains.
     """
     import optax  # an extra
 
@@ -177,7 +176,7 @@ def fit(
 def place_on_splats(
     anchors: Anchors, fitted: Appearance, views: Views, camera: Camera, config: PolishConfig
 ) -> np.ndarray:
-    """Place frames on splats that stay as they are; returns T_world_camera of each, (m, 4, 4)."""
+    """Fit the poses of frames to fixed splats; return T_world_camera of each, (m, 4, 4)."""
     import optax  # an extra
 
     adam, terms = optax.scale_by_adam(eps=1e-15), config.loss
@@ -205,11 +204,11 @@ def place_on_splats(
 
 
 def with_room(call: Callable[[LossConfig], tuple[Result, Array | int]], terms: LossConfig) -> tuple[Result, LossConfig]:
-    """Call with room for all splats in the tiles' lists: twice as much as long as some have none, and kept then.
+    """Double the capacity of the tiles' lists and repeat the call until all splats fit; return result and terms.
 
     Args:
-        call: returns its result and how many splats had no room.
-        terms: with the room so far.
+        call: returns its result and how many splats did not fit.
+        terms: with the current capacity.
     """
     while True:
         result, overflow = call(terms)
@@ -220,7 +219,7 @@ def with_room(call: Callable[[LossConfig], tuple[Result, Array | int]], terms: L
 
 
 class View(NamedTuple):
-    """One of `Views`, on the device; fields in its order."""
+    """One frame of `Views`, on the device; fields in its order."""
 
     row: Array
     target: Float[Array, "h w 4"]
@@ -230,26 +229,26 @@ class View(NamedTuple):
 
 
 def view_of(views: Views, row: int) -> View:
-    """The frame of this row."""
+    """Take the frame of this row."""
     target, *others = (jnp.asarray(x[row], jnp.float32) for x in (views.targets, *views[1:]))
     return View(jnp.int32(row), target, *others)
 
 
 def moved(view: View, offset: Float[Array, "6"]) -> jaxlie.SE3:
-    """The pose T Exp(spread u)."""
+    """Compute the pose T Exp(spread u)."""
     return jaxlie.SE3.from_matrix(view.pose) @ jaxlie.SE3.exp(view.spread @ offset)
 
 
 @full_precision
 def placed(views: Views, offsets: Float[Array, "m 6"]) -> np.ndarray:
-    """T_world_camera of all frames, moved: (m, 4, 4) float64; those without a spread stay to the bit."""
+    """Compute T_world_camera of all frames, (m, 4, 4) float64; frames without a spread stay to the bit."""
     xi = jnp.asarray(np.einsum("mij,mj->mi", views.spreads, np.asarray(offsets, np.float64)), jnp.float32)
     return views.poses @ np.asarray(jax.vmap(lambda x: jaxlie.SE3.exp(x).as_matrix())(xi), np.float64)
 
 
 def _signature(anchors: Anchors, colors: np.ndarray, config: PolishConfig) -> str:
-    """Return a digest of where the splats begin and of all settings."""
-    settings = replace(config, loss=jax.tree.map(float, config.loss))  # whose arrays would be shown by their shapes
+    """Compute a digest of the initial splats and all settings."""
+    settings = replace(config, loss=jax.tree.map(float, config.loss))  # its arrays would be shown only by their shapes
     digest = hashlib.sha256(repr(settings).encode())
     for values in (*jax.tree.leaves(anchors), colors):
         digest.update(np.ascontiguousarray(values).tobytes())
@@ -262,7 +261,7 @@ def _write(path: Path, step: int, state: State, signature: str) -> None:
 
 
 def _read(path: Path, state: State, signature: str) -> tuple[int, State]:
-    """Return the step to go on from and the state there; the beginning where there is none, or one of another fit."""
+    """Read the step to resume from and its state; the initial ones if there is no file, or it is of another fit."""
     leaves, tree = jax.tree.flatten(state)
     try:
         header, found = load_headed(path, {"signature": signature})
@@ -273,7 +272,7 @@ def _read(path: Path, state: State, signature: str) -> tuple[int, State]:
 
 
 def without_transparent(anchors: Anchors, fitted: Appearance, min_opacity: float) -> tuple[Anchors, Appearance]:
-    """The splats whose opacity is at least `min_opacity`; ValueError where none is left."""
+    """Keep the splats whose opacity is at least `min_opacity`; ValueError if none is left."""
     opacity = np.asarray(jax.nn.sigmoid(fitted.logit))
     keep = opacity >= min_opacity
     if not keep.any():

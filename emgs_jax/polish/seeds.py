@@ -1,4 +1,4 @@
-"""Start splats on the surface that the map shows in the frames, in the colours of their images."""
+"""Initial splats on the surface that the map shows in the frames, in the colours of their images."""
 
 from collections.abc import Callable, Sequence
 
@@ -9,15 +9,15 @@ import numpy as np
 from emgs_jax.ops.camera import Camera
 from emgs_jax.polish.splats import Anchors
 
-SAME_SURFACE = 0.05  # of the depth; a splat so near the map's surface stands for it
-STEEPEST = 0.3  # cosine; what is seen at a more grazing angle is left to frames that see it from the front
+SAME_SURFACE = 0.05  # of the depth; a splat this near to the map's surface covers it
+STEEPEST = 0.3  # cosine; surface at a more grazing angle is left to frames that see it from the front
 
 
 class Seeds:
-    """Splats on the surface that frames see, one for `pixels_per_splat` of the frame that has the most pixels of it.
+    """Splats on the surface that frames see, one for `pixels_per_splat` pixels of the frame that shows it largest.
 
-    A frame makes none where it sees a surface at a grazing angle or beside the silhouette of something nearer: there
-    its image shows what is behind, and the splat would be a long streak across what others see from the front.
+    A frame makes none at a grazing angle or beside the silhouette of something nearer. There its image shows what is
+    behind, and the splat would be a long streak across what others see from the front.
     """
 
     def __init__(self, camera: Camera, pixels_per_splat: int) -> None:
@@ -25,7 +25,7 @@ class Seeds:
         self._rows: list[tuple[np.ndarray, ...]] = []  # means, colours, axes, std of every frame that adds some
 
     def add(self, view, image: np.ndarray, pose: np.ndarray) -> None:
-        """Fill the cells of a frame in which no splat is yet, where it sees the surface well enough.
+        """Add a splat to every empty cell of a frame in which it sees the surface well enough.
 
         Args:
             view: `DenseView` of the map at the frame.
@@ -46,7 +46,7 @@ class Seeds:
         cosine = -np.einsum("ni,ni->n", rays, normals)
         is_frontal = cosine >= STEEPEST
         y, x, points, normals, rays, cosine = (v[is_frontal] for v in (y, x, points, normals, rays, cosine))
-        along = rays + cosine[:, None] * normals + 1e-6 * pose[:3, 0]  # in which direction the surface is foreshortened
+        along = rays + cosine[:, None] * normals + 1e-6 * pose[:3, 0]  # direction of foreshortening
         along -= np.einsum("ni,ni->n", along, normals)[:, None] * normals
         along /= np.linalg.norm(along, axis=1, keepdims=True)
         axes = np.stack([along, np.cross(normals, along), normals], axis=2)
@@ -55,7 +55,7 @@ class Seeds:
         self._rows.append((points, image[y, x], axes, std))
 
     def _held(self, view, pose: np.ndarray, counts: Sequence[int]) -> np.ndarray:
-        """Mark the cells of the frame that hold a splat on the surface that the map shows there."""
+        """Mark the frame's cells that already hold a splat on the surface that the map shows there."""
         held, (height, width) = np.zeros(counts, bool), view.depth.shape
         for means, *_ in self._rows:
             local = (means - pose[:3, 3]) @ pose[:3, :3]
@@ -69,13 +69,13 @@ class Seeds:
         return held
 
     def anchors(self, noise: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> tuple[Anchors, np.ndarray]:
-        """All of them, and their colours; `noise(means, normals)` is the map's, m."""
+        """Return all splats as anchors, and their colours; `noise(means, normals)` is the map's, m."""
         means, colors, axes, std = (np.concatenate(column) for column in zip(*self._rows, strict=True))
         values = means, axes, std, noise(means, axes[..., 2])
         return Anchors(*(jnp.asarray(value, jnp.float32) for value in values)), colors
 
 
 def _at_edge(depth: np.ndarray) -> np.ndarray:
-    """Mark pixels beside which the map's depth jumps: there an image may show what is behind."""
+    """Mark pixels beside a jump of the map's depth, where an image may show what is behind."""
     low, high = (change(depth, np.ones((3, 3), np.uint8)) for change in (cv2.erode, cv2.dilate))
     return high - low > SAME_SURFACE * depth

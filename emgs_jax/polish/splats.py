@@ -1,4 +1,4 @@
-"""Flat splats on the map's surface, what of them is fitted, and by which loss."""
+"""Flat splats on the map's surface, their fitted parameters, and the loss."""
 
 from functools import partial
 from typing import NamedTuple
@@ -15,17 +15,17 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import traced
 from emgs_jax.render.composite import RenderConfig, Rendering, render_splats, splats_of
 
-FLATNESS = 0.1  # thickness of a splat as a share of its smaller width where it begins
+FLATNESS = 0.1  # initial thickness of a splat as a share of its smaller width
 
 
 class Anchors(eqx.Module):
-    """Places where splats begin, which are not fitted.
+    """Initial places of splats, which are not fitted.
 
     Args:
         means: m, world.
-        axes: columns are the two directions along the surface and the normal.
+        axes: columns are the two directions along the surface, and the normal.
         std: m, along the first two.
-        noise: m; a mean may leave the surface by so much, the map's own standard deviation along the normal.
+        noise: m; how far a mean may leave the surface: the map's standard deviation along the normal.
     """
 
     means: Float[Array, "n 3"]
@@ -35,14 +35,14 @@ class Anchors(eqx.Module):
 
 
 class Appearance(eqx.Module):
-    """Parameters of every splat that are fitted.
+    """Fitted parameters of every splat.
 
     Args:
         colors: RGB.
         logit: of the opacity.
         log_std: logarithm of the factor on the anchor's widths.
-        turn: of the anchor's axes, in those axes, a rotation vector (rad).
-        shift: along the normal, `noise` · tanh of it.
+        turn: rotation vector (rad) of the anchor's axes, in those axes.
+        shift: argument of the shift along the normal, `noise` · tanh(shift).
     """
 
     colors: Float[Array, "n 3"]
@@ -53,12 +53,12 @@ class Appearance(eqx.Module):
 
 
 class Shot(NamedTuple):
-    """An image, from where it was taken, and how its exposure differs from the others'.
+    """An image with its pose and exposure.
 
     Args:
-        target: RGB of the image and the map's depth (m), 0 where it has none: such pixels count in no term.
-        T_world_camera: of the camera.
-        gain: of each channel, by which the splats' colours become the image's.
+        target: RGB of the image and the map's depth (m); pixels of depth 0 count in no term.
+        T_world_camera: its pose.
+        gain: factor for each channel from the splats' colours to the image's.
     """
 
     target: Float[Array, "h w 4"]
@@ -66,18 +66,18 @@ class Shot(NamedTuple):
     gain: Float[Array, "3"]
 
 
-# As 3DGS draws; where a tile's capacity is too little it is doubled.
+# As 3DGS draws; the capacity of tiles is doubled when it is too small.
 AS_3DGS = {"tile_size": 8, "tile_capacity": 192, "tile_batch": 1024, "opacity": 1.0}
 
 
 class LossConfig(eqx.Module):
-    """Weights of the loss, and how splats are drawn.
+    """Weights of the loss, and rendering of splats.
 
     Args:
-        dssim: share of D-SSIM in the photometric term, the rest is L1 (Kerbl et al. 2023: .2).
-        depth: of the relative difference to the map's depth.
-        normal: of 1 - cos between normals of splats and those of the map.
-        render: how splats are drawn; its opacity is that of a splat with opacity 1.
+        dssim: share of D-SSIM in the photometric term; the rest is L1 (Kerbl et al. 2023: .2).
+        depth: weight of the relative difference to the map's depth.
+        normal: weight of 1 - cos between normals of splats and of the map.
+        render: rendering; its opacity is that of a splat with opacity 1.
     """
 
     dssim: Float[Array, "*b"] = traced(0.2, low=0, high=1)
@@ -87,7 +87,7 @@ class LossConfig(eqx.Module):
 
 
 def initial(colors: Float[Array, "n 3"], opacity: Float[Array, ""]) -> Appearance:
-    """Splats as their anchors are, in these colours."""
+    """Make splats equal to their anchors, in these colours."""
     count = colors.shape[0]
     logit = jnp.full(count, jnp.log(opacity / (1.0 - opacity)))
     return Appearance(colors, logit, jnp.zeros((count, 2)), jnp.zeros((count, 3)), jnp.zeros(count))
@@ -95,7 +95,7 @@ def initial(colors: Float[Array, "n 3"], opacity: Float[Array, ""]) -> Appearanc
 
 @full_precision
 def gaussians_of(anchors: Anchors, fitted: Appearance) -> tuple[Gaussians, Float[Array, "n"]]:
-    """Flat Gaussians of the world, without features, and their opacities in (0, 1)."""
+    """Convert splats to flat Gaussians in the world, without features, and opacities in (0, 1)."""
     axes = anchors.axes @ jaxlie.SO3.exp(fitted.turn).as_matrix()
     thickness = FLATNESS * jnp.min(anchors.std, axis=-1, keepdims=True)
     std = jnp.concatenate([anchors.std * jnp.exp(fitted.log_std), thickness], axis=-1)
@@ -111,19 +111,19 @@ def gaussians_of(anchors: Anchors, fitted: Appearance) -> tuple[Gaussians, Float
 def draw(
     gaussians: Gaussians, opacity: Float[Array, "n"], T: jaxlie.SE3, camera: Camera, config: RenderConfig
 ) -> Rendering:
-    """Colours of Gaussians with an opacity each, over black, from T_world_camera."""
+    """Render Gaussians with an opacity each, over black, from T_world_camera."""
     splats = splats_of(gaussians, T, camera, config)
     splats = eqx.tree_at(lambda s: s.opacity, splats, opacity)
     return render_splats(splats, gaussians.colors, camera, config)
 
 
 class Misfit(NamedTuple):
-    """Errors that `loss` has seen.
+    """Errors measured by `loss`.
 
     Args:
         mean_sq: squared error of the colours.
-        gain: with which the picture of the splats would be as bright as the image.
-        overflow: splats that had no room in the tiles' lists.
+        gain: with which the splats' picture would be as bright as the image.
+        overflow: splats that did not fit into the tiles' lists.
     """
 
     mean_sq: Float[Array, ""]
@@ -135,7 +135,7 @@ class Misfit(NamedTuple):
 def loss(
     fitted: Appearance, anchors: Anchors, shot: Shot, camera: Camera, c: LossConfig
 ) -> tuple[Float[Array, ""], Misfit]:
-    """Photometric loss of 3DGS with depth and normals of the map as terms."""
+    """Compute the photometric loss of 3DGS plus terms of the map's depth and normals."""
     gaussians, opacity = gaussians_of(anchors, fitted)
     drawn = draw(gaussians, opacity, shot.T_world_camera, camera, c.render)
     image, depth = shot.target[..., :3], shot.target[..., 3]
@@ -155,9 +155,9 @@ def loss(
 def relative_gain(
     picture: Float[Array, "h w 3"], image: Float[Array, "h w 3"], is_seen: Bool[Array, "h w"]
 ) -> Float[Array, "3"]:
-    """Ratio of the channels' means over the pixels that are seen; 1 where all is black.
+    """Compute the ratio of the channels' means over visible pixels; 1 if everything is black.
 
-    A regression would be the lower the more the picture is blurred or displaced.
+    A regression would be biased: lower the more the picture is blurred or displaced.
     """
     of_image, of_picture = (jnp.sum(jnp.where(is_seen[..., None], x, 0.0), axis=(0, 1)) for x in (image, picture))
     is_lit = (of_image > 0) & (of_picture > 0)
@@ -166,7 +166,7 @@ def relative_gain(
 
 @full_precision
 def ssim(a: Float[Array, "h w c"], b: Float[Array, "h w c"]) -> Float[Array, ""]:
-    """Mean structural similarity, window of 11 pixels with σ = 1.5, zero outside (Wang et al. 2004; as 3DGS)."""
+    """Compute mean structural similarity: window of 11 pixels, σ = 1.5, zero outside (Wang et al. 2004; as 3DGS)."""
     rows, columns = (_window(side) for side in a.shape[:2])
     planes = jnp.concatenate([a, b, a * a, b * b, a * b], axis=-1)
     blurred = jnp.einsum("yi,xj,ijc->yxc", rows, columns, planes)
@@ -177,7 +177,7 @@ def ssim(a: Float[Array, "h w c"], b: Float[Array, "h w c"]) -> Float[Array, ""]
 
 
 def _window(side: int) -> Float[Array, "s s"]:
-    """The blur along one axis as a matrix: two products instead of a convolution."""
+    """Make the blur along one axis as a matrix: two products replace a convolution."""
     offsets = jnp.arange(side)[:, None] - jnp.arange(side)
     weights = jnp.exp(-0.5 * jnp.arange(-5.0, 6.0) ** 2 / 1.5**2)
     return jnp.where(jnp.abs(offsets) <= 5, jnp.exp(-0.5 * offsets**2 / 1.5**2) / jnp.sum(weights), 0.0)

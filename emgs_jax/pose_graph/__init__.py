@@ -1,1 +1,1 @@
-"""Poses that move when the camera comes back to a place: measurements between them, and the best poses for these."""
+"""Pose graph: measurements between poses, the poses that fit them best, and the map that deforms with them."""

@@ -1,4 +1,4 @@
-"""Initial poses for the solver: the error of every loop closure spread over its path, rotations first (chordal)."""
+"""Initial poses for the solver: spread the error of every loop closure over its path, rotations first (chordal)."""
 
 import jaxlie
 import numpy as np
@@ -11,18 +11,18 @@ from emgs_jax.pose_graph.sparse import damped_step, normal_equations
 
 @full_precision
 def chordal_initialization(graph: PoseGraph, free: np.ndarray) -> Nodes | None:
-    """The best poses where every error is quadratic: two linear problems, whatever the poses are now.
+    """Solve for the poses as two linear problems, independent of the current poses.
 
-    First R_a Z = R_b as nine numbers each, put back to rotations; then t_b − t_a = e^{σ_a} R_a z with these. Every
-    measurement counts by the mean of its information on rotation or translation; scales stay.
+    First R_a Z = R_b for nine numbers each, projected back to rotations; then t_b − t_a = e^{σ_a} R_a z with these.
+    Every measurement is weighted by the mean of its information on rotation or translation; scales stay.
     Source: Carlone et al., "Initialization techniques for 3D SLAM", 2015, section V.B.
 
     Args:
         graph: every factor in use and finite.
-        free: (n, 7) unknowns that may move; others than these keep their value.
+        free: (n, 7) unknowns that may change; the others keep their value.
 
     Returns:
-        Nodes; None where a linear problem cannot be solved.
+        Nodes; None if a linear problem cannot be solved.
     """
     nodes, factors = graph.nodes, graph.factors
     ends = np.stack([factors.a, factors.b], axis=-1)
@@ -68,7 +68,7 @@ def _solve(
     offsets: np.ndarray,
     free: np.ndarray,
 ) -> np.ndarray | None:
-    """Least squares of weights · (carry x_a + offset − x_b) over x (n, d, c), from the initial `values`."""
+    """Minimise weights · (carry x_a + offset − x_b) over x (n, d, c) in least squares, from the initial `values`."""
     a, b = ends.T
     errors = weights * (carry @ values[a] + offsets - values[b])
     degrees = values.shape[1]

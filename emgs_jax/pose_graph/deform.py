@@ -1,4 +1,4 @@
-"""A map that follows its frames: every Gaussian moves as those of its neighbourhood were born."""
+"""Deform a map with its poses: every Gaussian moves with the frames that made it and its neighbours."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -15,11 +15,12 @@ from emgs_jax.registration.rigid import pose_row
 
 
 class DeformConfig(eqx.Module):
-    """Over which Gaussians a motion is averaged, so that a surface which several frames made has no seams.
+    """Over which Gaussians a motion is averaged, so that a surface from several frames has no seams.
 
     Args:
-        num_neighbours: nearest Gaussians, itself among them; 1: each moves with the frame of its own birth alone.
-        max_gap: nodes between the births of a Gaussian and of one that counts: two visits of a place move apart.
+        num_neighbours: nearest Gaussians, including itself; 1: each moves only with the frame that made it.
+        max_gap: largest number of nodes between the births of a Gaussian and a neighbour that counts; so two visits of
+            a place move apart.
     """
 
     num_neighbours: int = static(9, low=1, high=256)
@@ -27,7 +28,7 @@ class DeformConfig(eqx.Module):
 
 
 class _Motions(eqx.Module):
-    """Similarities that move the surroundings of nodes from their old to their new poses: x' = s ΔR (x - t) + t'."""
+    """Similarities that move the surroundings of nodes from old to new poses: x' = s ΔR (x - t) + t'."""
 
     turn: jaxlie.SO3
     scale: Float[Array, "*n"]
@@ -40,7 +41,7 @@ class _Motions(eqx.Module):
 
 
 def _motions(before: Nodes, after: Nodes) -> _Motions:
-    """Of each node, and whether it moved at all; one that is not in use stays, whatever it holds."""
+    """Compute the motion of each node and whether it moved; a node that is not in use stays."""
     count = before.valid.shape[0]
     still = Nodes(jaxlie.SE3.identity((count,)), jnp.zeros(count), before.valid)
     before, after = (where_rows(before.valid, nodes, still) for nodes in (before, after))
@@ -55,21 +56,21 @@ def _motions(before: Nodes, after: Nodes) -> _Motions:
 def deform(
     map: GaussianMap, before: Nodes, after: Nodes, min_std: Float[Array, ""], config: DeformConfig
 ) -> GaussianMap:
-    """Move every Gaussian as the cameras moved by which it and its neighbours were made.
+    """Move every Gaussian with the cameras that made it and its neighbours.
 
-    A node's motion is x' = s ΔR (x - t) + t' with ΔR = R' Rᵀ and s = e^{σ' - σ}: the scale acts in the old camera's
-    frame, so that what the camera saw at a pixel stays at it. A Gaussian takes the mean over its neighbours' births of
-    where it would go, μ' = mean x'_k(μ), and of how it would turn and grow: Σ' = s² ΔR (Σ - min_std² I) ΔRᵀ +
-    min_std² I, n' = ΔR n. Where all of them moved alike that is their motion.
+    A node's motion is x' = s ΔR (x - t) + t' with ΔR = R' Rᵀ and s = e^{σ' - σ}. The scale acts in the old camera's
+    frame, so that a point stays at its pixel. A Gaussian averages over the births of its neighbours: its position,
+    μ' = mean x'_k(μ), and its rotation and scale, Σ' = s² ΔR (Σ - min_std² I) ΔRᵀ + min_std² I, n' = ΔR n. If all of
+    them moved alike, it moves with them.
 
     Args:
         map: world frame; `birth` is the row of a node.
-        before: the nodes that the map conforms to.
-        after: the same, where they are to be.
-        min_std: m; the floor of the covariances, which is no length of the scene.
+        before: the nodes to which the map conforms.
+        after: the same nodes at their new poses.
+        min_std: m; floor of the covariances, which does not scale with the scene.
 
     Returns:
-        The map; a Gaussian of whose neighbours no node moved is the same bit for bit.
+        The map; if no node of its neighbourhood moved, a Gaussian is the same bit for bit.
     """
     gaussians = map.gaussians
     births, counts = _births(map, config)
@@ -84,7 +85,7 @@ def deform(
 
 
 def _births(map: GaussianMap, config: DeformConfig) -> tuple[Int[Array, "n k"], Float[Array, "n k"]]:
-    """Nodes by which a Gaussian and its neighbours were made, its own first, and 1 where one counts."""
+    """Find the nodes that made a Gaussian and its neighbours, its own first, and 1 for those that count."""
     gaussians, own = map.gaussians, map.birth[:, None]
     num = min(config.num_neighbours, map.birth.shape[0])
     if num == 1:
@@ -96,7 +97,7 @@ def _births(map: GaussianMap, config: DeformConfig) -> tuple[Int[Array, "n k"], 
 
 
 def _mean_turn(turns: jaxlie.SO3, share: Float[Array, "n k"]) -> jaxlie.SO3:
-    """Weighted mean of rotations that are near the first: of quaternions on the side of its own, made a unit again."""
+    """Average rotations that are near the first: align the signs of their quaternions, average, normalise."""
     sides = jnp.sign(jnp.einsum("nki,ni->nk", turns.wxyz, turns.wxyz[:, 0]))
     mean = jnp.einsum("nk,nki->ni", share * sides, turns.wxyz)
     return jaxlie.SO3(mean / jnp.linalg.norm(mean, axis=-1, keepdims=True))
@@ -104,7 +105,7 @@ def _mean_turn(turns: jaxlie.SO3, share: Float[Array, "n k"]) -> jaxlie.SO3:
 
 @full_precision
 def deform_view(view: Observation, before: Nodes, after: Nodes, row: Int[Array, ""]) -> Observation:
-    """A frame that was placed by node `row`, world frame, where that node is now; see `deform`."""
+    """Move a frame (world frame) with its node `row`, see `deform`."""
     motions = _motions(before, after)
     old, new = (pose_row(nodes.T_world, row) for nodes in (before, after))
     moved = transform(new, transform(old.inverse(), view, jnp.ones(())), motions.scale[row])

@@ -14,7 +14,7 @@ DEGREES = 7  # of a node: translation, rotation (jaxlie's order), log-scale
 
 
 class Nodes(eqx.Module):
-    """One node for each integrated frame and its inference. The first valid one is the gauge: it never moves.
+    """One node for each integrated frame and its inference. The first valid one fixes the gauge: it never moves.
 
     Args:
         T_world: pose of the frame's camera, m in the map's scale.
@@ -36,8 +36,8 @@ class Factors(eqx.Module):
         Z_a_b: T_a⁻¹ T_b, its translation in the units of a's inference (the map's, times e^{−σ_a}).
         log_ratio: measured σ_b − σ_a: log of the median ratio of the same points' depths in a's inference and in b's.
         sqrt_info: W, with WᵀW the information of (translation, rotation, log-scale); a zero row is not measured.
-        is_loop: measured by a loop closure, which may be an outlier; sequential, map and join factors are none.
-        valid: rows in use; the others may hold anything. A factor with a node that is not in use is not either.
+        is_loop: measured by a loop closure, and so possibly an outlier; False for sequential, map and join factors.
+        valid: rows in use; the others may hold anything. A factor of a node that is not in use is not used either.
     """
 
     a: Int[Array, "e"]
@@ -58,13 +58,13 @@ class PoseGraph(eqx.Module):
 
 @full_precision
 def move(nodes: Nodes, steps: Float[Array, "n 7"]) -> Nodes:
-    """Right perturbation: T Exp(step) and σ + step, in the order translation, rotation, log-scale."""
+    """Perturb nodes from the right: T Exp(step) and σ + step; order translation, rotation, log-scale."""
     T = (nodes.T_world @ jaxlie.SE3.exp(steps[:, :6])).normalize()
     return Nodes(T, nodes.log_scale + steps[:, 6], nodes.valid)
 
 
 def factors_in_use(graph: PoseGraph) -> Bool[Array, "e"]:
-    """Edges that are valid and whose two nodes are."""
+    """Find the factors that are valid and whose two nodes are."""
     nodes, factors = graph.nodes, graph.factors
     n = nodes.valid.shape[0]
     exists = (factors.a >= 0) & (factors.a < n) & (factors.b >= 0) & (factors.b < n)
@@ -73,9 +73,9 @@ def factors_in_use(graph: PoseGraph) -> Bool[Array, "e"]:
 
 
 def _residual(ends: Nodes, factor: Factors) -> Float[Array, "7"]:
-    """W (Log(Z⁻¹ (R_aᵀR_b, e^{−σ_a} R_aᵀ(t_b − t_a))), σ_b − σ_a − log_ratio) of one factor and its two nodes.
+    """Compute W (Log(Z⁻¹ (R_aᵀR_b, e^{−σ_a} R_aᵀ(t_b − t_a))), σ_b − σ_a − log_ratio) of a factor and its two nodes.
 
-    In the inference's own units: a growing σ_a cannot buy a lower cost.
+    It is in the inference's own units, so that a growing σ_a cannot lower the cost.
     """
     T_a_b = pose_row(ends.T_world, 0).inverse() @ pose_row(ends.T_world, 1)
     error = (factor.Z_a_b.inverse() @ scale_translation(T_a_b, jnp.exp(-ends.log_scale[0]))).log()
@@ -83,7 +83,7 @@ def _residual(ends: Nodes, factor: Factors) -> Float[Array, "7"]:
 
 
 def _with_ends(nodes: Nodes, factor: Factors, used: Bool[Array, ""]) -> tuple[Nodes, Factors]:
-    """Return the two nodes of a factor, and the factor; neutral values where it is not in use."""
+    """Return the two nodes of a factor, and the factor; neutral values if it is not in use."""
     ends = take_rows(nodes, jnp.where(used, jnp.stack([factor.a, factor.b]), 0))
     still = jnp.zeros_like(factor.Z_a_b.wxyz_xyz).at[0].set(1.0)
     zeros = jnp.zeros_like(factor.log_ratio), jnp.zeros_like(factor.sqrt_info)
@@ -94,7 +94,7 @@ def _with_ends(nodes: Nodes, factor: Factors, used: Bool[Array, ""]) -> tuple[No
 
 @full_precision
 def residuals(graph: PoseGraph) -> Float[Array, "e 7"]:
-    """Whitened residual of every factor, see `_residual`; 0 where a factor is not in use."""
+    """Compute the whitened residual of every factor, see `_residual`; 0 for a factor that is not in use."""
 
     def of_factor(factor: Factors, used: Bool[Array, ""]) -> Float[Array, "7"]:
         return _residual(*_with_ends(graph.nodes, factor, used))
@@ -104,7 +104,7 @@ def residuals(graph: PoseGraph) -> Float[Array, "e 7"]:
 
 @full_precision
 def linearize(graph: PoseGraph) -> tuple[Float[Array, "e 7"], Float[Array, "e 7 14"]]:
-    """Residuals, and their derivatives by the steps of `move` of the nodes a and b; 0 where a factor is not in use."""
+    """Compute residuals and derivatives by the steps of `move` of nodes a and b; 0 for factors that are not in use."""
 
     def of_factor(factor: Factors, used: Bool[Array, ""]) -> tuple[Float[Array, "7"], Float[Array, "7 14"]]:
         ends, factor = _with_ends(graph.nodes, factor, used)
@@ -122,7 +122,7 @@ def linearize(graph: PoseGraph) -> tuple[Float[Array, "e 7"], Float[Array, "e 7 
 def robust(
     chi2: Float[Array, "e"], is_loop: Bool[Array, "e"], kernel: Float[Array, ""]
 ) -> tuple[Float[Array, "e"], Float[Array, "e"]]:
-    """Cost of every factor and the weight of its χ² in the quadratic model: dynamic covariance scaling on loops.
+    """Compute each factor's cost and the weight of its χ² in the quadratic model: dynamic covariance scaling on loops.
 
     ρ = χ²/2 up to φ, and 2φχ²/(φ + χ²) − φ/2 beyond, which never exceeds 3φ/2; weight s², s = min(1, 2φ/(φ + χ²)).
     Source: Agarwal et al., "Robust map optimization using dynamic covariance scaling", 2013; the kernel after MacTavish
@@ -130,7 +130,7 @@ def robust(
 
     Args:
         chi2: squared norm of the residuals.
-        is_loop: the others are quadratic.
+        is_loop: loop factors; the others are quadratic.
         kernel: φ > 0; inf: quadratic.
     """
     excess = jnp.where(is_loop, chi2 / kernel, 0.0)

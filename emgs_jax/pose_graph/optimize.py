@@ -16,7 +16,7 @@ from emgs_jax.pose_graph.factors import DEGREES, Nodes, PoseGraph
 from emgs_jax.pose_graph.problem import Linear, Problem, linear, moved, num_rows, problem_of
 from emgs_jax.pose_graph.sparse import damped_step
 
-# χ² of a measured row that nothing is to be gained from: errors of a thousandth of their standard deviation.
+# χ² of a measured row from which nothing can be gained: errors of a thousandth of their standard deviation.
 NOTHING_TO_GAIN = 1e-6
 LEAST_DAMPING, MAX_DAMPING = 1e-6, 1e8
 
@@ -25,15 +25,15 @@ class PoseGraphConfig(eqx.Module):
     """Settings of the pose-graph optimization: scale prior, robust kernel, start, convergence and acceptance.
 
     Args:
-        scale_std: s_p: standard deviation of every σ about 0; 0: scales stay as they are (SE(3)); inf: no prior, for
-            one that is not metric. Those of a metric model err by 3 %, alike for some 50 frames: .2.
+        scale_std: s_p: standard deviation of every σ about 0. 0: scales stay (SE(3)); inf: no prior, for predictions
+            that are not metric. Scales of a metric model have errors of 3 %, shared by some 50 frames: .2.
         kernel: φ of dynamic covariance scaling on loop factors, in χ²; inf: quadratic.
-        start: `current` poses, or `chordal` (errors spread over the paths, where that costs less; and, where a loop
-            would be rejected, the solution with all loops at full weight).
-        max_iterations: of Levenberg and Marquardt; 0: nothing moves.
-        damping: λ at the start, times the Hessian's diagonal; from 0 on it is Gauss and Newton's until a step fails.
-        min_decrease: relative, of the cost; less has converged.
-        max_misfit: χ² per measured row of all but loops: a result that bends these more than that, and than they were,
+        start: `current` poses, or `chordal`: errors spread over the paths if that costs less and, if a loop would be
+            rejected, the solution with all loops at full weight.
+        max_iterations: of Levenberg–Marquardt; 0: nothing moves.
+        damping: initial λ, times the Hessian's diagonal; 0 is Gauss–Newton until a step fails.
+        min_decrease: relative, of the cost; a smaller decrease means convergence.
+        max_misfit: χ² per measured row of all factors but loops; a result that bends these more, and more than before,
             is refused.
     """
 
@@ -48,16 +48,16 @@ class PoseGraphConfig(eqx.Module):
 
 @dataclass(frozen=True)
 class PoseGraphInfo:
-    """Result of a pose-graph optimization, reported also where it is refused and the nodes stay.
+    """Result of a pose-graph optimization, also if it is refused and the nodes stay.
 
     Args:
-        reason: why the nodes stay where they were; empty: they moved, or there is nothing to gain.
+        reason: why the nodes stay; empty if they moved or if there is nothing to gain.
         cost_before: Σρ over factors, and half the squared scale prior.
         cost: likewise, at the end.
-        factor_chi2: (e,) χ² of every factor at the end, unweighted; 0 where it is not in use.
+        factor_chi2: (e,) χ² of every factor at the end, unweighted; 0 for a factor that is not in use.
         factor_weights: (e,) share of that χ² that counts: s² of dynamic covariance scaling, 1 for all but loops.
-        dof: measured rows, those of the scale prior included, minus free unknowns.
-        num_disconnected: nodes without a path to the gauge, which stay where they are.
+        dof: measured rows, including the scale prior, minus free unknowns.
+        num_disconnected: nodes without a path to the gauge, which stay.
     """
 
     reason: str
@@ -72,7 +72,7 @@ class PoseGraphInfo:
 
 
 def _minimize(problem: Problem, now: Linear, config: PoseGraphConfig) -> tuple[Linear, int, bool]:
-    """Levenberg and Marquardt: the best that was found, the number of tried steps, and whether it converged."""
+    """Minimise by Levenberg–Marquardt: return the best nodes, the number of tried steps, and whether it converged."""
     damping, kernel = float(config.damping), float(config.kernel)
     floor = NOTHING_TO_GAIN * sum(num_rows(problem.graph.factors))
     for iteration in range(config.max_iterations):
@@ -123,7 +123,7 @@ def _refused(graph: PoseGraph, reason: str) -> PoseGraphInfo:
 
 
 def _start(problem: Problem, initial: Linear, config: PoseGraphConfig) -> Linear:
-    """Return the initial nodes, or those with the errors spread, whichever cost less."""
+    """Return the initial nodes, or those with errors spread over the paths, whichever costs less."""
     nodes = chordal_initialization(problem.graph, problem.free) if config.start == "chordal" else None
     if nodes is None:
         return initial
@@ -132,9 +132,10 @@ def _start(problem: Problem, initial: Linear, config: PoseGraphConfig) -> Linear
 
 
 def _solve(problem: Problem, initial: Linear, config: PoseGraphConfig) -> tuple[Linear, int, bool]:
-    """Return the better of two searches if the first downweights a loop; the second starts with all at full weight.
+    """Search once; if that downweights a loop, search again from the solution with all loops at full weight.
 
-    The cost of a loop is bounded, so a loop that is violated too much at the start stays an outlier.
+    Returns the better result. The cost of a loop is bounded, so a loop that is strongly violated at the start would
+    stay an outlier.
     """
     found = _minimize(problem, _start(problem, initial, config), config)
     is_loop = np.asarray(problem.graph.factors.is_loop)
@@ -148,7 +149,7 @@ def _solve(problem: Problem, initial: Linear, config: PoseGraphConfig) -> tuple[
 
 
 def _rejection(problem: Problem, initial: Linear, end: Linear, converged: bool, config: PoseGraphConfig) -> str:
-    """Return why a solution is rejected; empty where it is accepted."""
+    """Return why a solution is rejected; empty if it is accepted."""
     if end is initial and not converged:
         return "no step lowers the cost"
     factors = problem.graph.factors
@@ -161,7 +162,7 @@ def _rejection(problem: Problem, initial: Linear, end: Linear, converged: bool, 
 
 
 def _write_back(nodes: Nodes, problem: Problem, end: Nodes) -> Nodes:
-    """The nodes that may move, in the given precision; the others bit for bit."""
+    """Write back the nodes that may move, in the given precision; the others stay bit for bit."""
     n = nodes.valid.shape[0]
 
     def put(old: Array, new: Array, free: np.ndarray) -> Array:
@@ -172,11 +173,11 @@ def _write_back(nodes: Nodes, problem: Problem, end: Nodes) -> Nodes:
 
 
 def optimize(graph: PoseGraph, config: PoseGraphConfig) -> tuple[Nodes, PoseGraphInfo]:
-    """Poses and scales of least Σρ(χ²) + Σ(σ/s_p)²/2; the first valid node keeps its own.
+    """Find the poses and scales of least Σρ(χ²) + Σ(σ/s_p)²/2; the first valid node stays.
 
-    Nodes without a path of measurements to it stay where they are. What is computed is float64, whatever the graph is
-    stored in. Nothing is raised: where the graph cannot be solved or there is nothing to gain, the nodes that were
-    given come back, and `PoseGraphInfo.reason` says why (empty where there is nothing to gain).
+    So do nodes without a path of measurements to it. Computes in float64, whatever the graph is stored in. Never
+    raises: if the graph cannot be solved or there is nothing to gain, it returns the given nodes, and
+    `PoseGraphInfo.reason` says why (empty if there is nothing to gain).
     """
     num_edges = graph.factors.a.shape[0]
     with jax.enable_x64(True):

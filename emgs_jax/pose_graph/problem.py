@@ -1,4 +1,4 @@
-"""A graph as it is solved: checked, in float64, padded, the gauge's part only; and its linearisation."""
+"""The graph that is solved: checked, in float64, padded, only the part with the gauge; and its linearisation."""
 
 from typing import NamedTuple
 
@@ -16,11 +16,11 @@ from emgs_jax.pose_graph.sparse import NormalEquations, normal_equations
 
 
 class Problem(NamedTuple):
-    """A graph as it is solved: float64, in buckets of powers of two, the gauge's part only.
+    """The graph that is solved: float64, padded to powers of two, only the part with the gauge.
 
     Args:
         graph: padded; factors of other parts are not in use.
-        free: (n, 7) unknowns that may move.
+        free: (n, 7) unknowns that may change.
         scale_information: 1/s_p²; 0 without a prior.
         used: (e,) factors of the original graph that count.
         num_disconnected: nodes.
@@ -34,7 +34,7 @@ class Problem(NamedTuple):
 
 
 class Linear(NamedTuple):
-    """The problem about some nodes."""
+    """The problem, linearised at some nodes."""
 
     nodes: Nodes
     cost: float
@@ -49,19 +49,19 @@ _robust = jax.jit(robust)
 
 
 def _pad(array: object, count: int) -> np.ndarray:
-    """In float64 if it has numbers, with rows of zeros up to `count`."""
+    """Convert numbers to float64 and pad with rows of zeros up to `count`."""
     array = np.asarray(array)
     array = array.astype(np.float64) if np.issubdtype(array.dtype, np.floating) else array
     return np.concatenate([array, np.zeros((count - len(array), *array.shape[1:]), array.dtype)])
 
 
 def bucket(count: int) -> int:
-    """The next power of two, from 64 on: a growing graph compiles rarely."""
+    """Round up to a power of two, at least 64, so that a growing graph compiles rarely."""
     return max(64, 1 << (max(count, 1) - 1).bit_length())
 
 
 def _parts(graph: PoseGraph, used: np.ndarray) -> np.ndarray:
-    """(n,) nodes in use with a path of measurements to the first one in use."""
+    """Find the nodes (n,) in use with a path of measurements to the first one in use."""
     valid = np.asarray(graph.nodes.valid)
     joins = used & np.any(np.asarray(graph.factors.sqrt_info) != 0, axis=(1, 2))
     a, b = np.asarray(graph.factors.a)[joins], np.asarray(graph.factors.b)[joins]
@@ -107,7 +107,7 @@ def problem_of(graph: PoseGraph, scale_std: float) -> Problem | str:
 
 
 def linear(problem: Problem, nodes: Nodes, kernel: float) -> Linear:
-    """Cost and normal equations about some nodes."""
+    """Compute cost and normal equations at some nodes."""
     factors = problem.graph.factors
     residuals, jacobians = map(np.asarray, _linearize(PoseGraph(nodes, factors)))
     chi2 = np.sum(residuals**2, axis=1)
@@ -123,7 +123,7 @@ def linear(problem: Problem, nodes: Nodes, kernel: float) -> Linear:
 
 
 def num_rows(factors: Factors) -> tuple[int, int]:
-    """Measured rows of the factors in use: of loops, and of all others."""
+    """Count the measured rows of the factors in use: of loops, and of all others."""
     counts = np.any(np.asarray(factors.sqrt_info) != 0, axis=2).sum(axis=1) * np.asarray(factors.valid)
     is_loop = np.asarray(factors.is_loop)
     return int(np.sum(counts[is_loop])), int(np.sum(counts[~is_loop]))

@@ -11,8 +11,8 @@ class NormalEquations(NamedTuple):
     """Hessian and gradient of ½|r|² by d unknowns of each of n nodes.
 
     Args:
-        hessian: (n·d, n·d); 1 on the diagonal of an unknown that is held or not measured.
-        gradient: (n·d, c), for c right-hand sides; 0 there.
+        hessian: (n·d, n·d); 1 on the diagonal of an unknown that is fixed or not measured.
+        gradient: (n·d, c), for c right-hand sides; 0 for these unknowns.
         measured: (n·d,) unknowns that are free and measured.
     """
 
@@ -30,8 +30,8 @@ def normal_equations(
         ends: (e, 2) the two nodes of each measurement.
         residuals: (e, r, c), for c right-hand sides.
         jacobians: (e, r, 2d), by the unknowns of both.
-        free: (n, d) unknowns that may move.
-        prior: (n, d, 1 + c): information of every unknown by itself, and its gradients.
+        free: (n, d) unknowns that may change.
+        prior: (n, d, 1 + c): information about each unknown alone, and its gradients.
     """
     num_nodes, degrees = free.shape
     unknowns = (ends[:, :, None] * degrees + np.arange(degrees)).reshape(len(ends), -1)
@@ -49,7 +49,7 @@ def normal_equations(
 
 
 def factorize(matrix: csc_array) -> SuperLU | None:
-    """Factors of a symmetric positive definite matrix; None where it is singular."""
+    """Factorize a symmetric positive definite matrix; None if it is singular."""
     try:
         # A positive definite matrix needs no pivoting, which would destroy the order that keeps the factors sparse.
         return splu(matrix, permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options={"SymmetricMode": True})
@@ -58,6 +58,6 @@ def factorize(matrix: csc_array) -> SuperLU | None:
 
 
 def damped_step(equations: NormalEquations, damping: float) -> np.ndarray | None:
-    """The step −(H + λ diag H)⁻¹ g, (n·d, c), of Levenberg and Marquardt; None where the matrix is singular."""
+    """Compute the Levenberg–Marquardt step −(H + λ diag H)⁻¹ g, (n·d, c); None if the matrix is singular."""
     factors = factorize((equations.hessian + diags_array(damping * equations.hessian.diagonal())).tocsc())
     return None if factors is None else factors.solve(-equations.gradient)

@@ -1,1 +1,1 @@
-"""Placing points on Gaussians: rigid motions, matching, ICP."""
+"""Registration of points to Gaussians: rigid motions, matching, ICP."""

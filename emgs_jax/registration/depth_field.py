@@ -9,8 +9,8 @@ from jaxtyping import Array, Bool, Float
 from emgs_jax.ops.precision import full_precision
 
 NUM_NODES = 5  # along each side of the image
-NUM_ROUNDS = 3  # of weights and field in turn
-NUM_INDEPENDENT = 160  # errors in an image beside the field: neighbouring points err alike
+NUM_ROUNDS = 3  # of alternating between weights and field
+NUM_INDEPENDENT = 160  # independent errors in an image beside the field, since neighbouring points share theirs
 LEAST_SIDE = 1e-6  # of the image, in focal lengths
 LEAST_NOISE = 2.0**-22  # of a logarithm of depth: its rounding
 
@@ -19,7 +19,7 @@ class DepthField(eqx.Module):
     """Field f of the logarithm of depth, bilinear between nodes over a part of the image plane; 0 corrects nothing.
 
     Args:
-        nodes: f, by x and y.
+        nodes: f, indexed by x and y.
         low: (x/z, y/z) of the first node.
         high: of the last one.
     """
@@ -36,13 +36,13 @@ def depth_errors(
     center: Float[Array, "3"],
     min_cos: Float[Array, ""] | float,
 ) -> tuple[Float[Array, "p"], Bool[Array, "p"]]:
-    """Log of each point's depth over that at which its ray meets the plane of its Gaussian, and where that is known.
+    """Compute the log-ratio of each point's depth to that of its Gaussian's plane along the ray, and where it is known.
 
     ρ = log(n·(x - c) / n·(μ - c)), as in the fine step (R9); 0 where it is unknown.
 
     Args:
         points: world frame.
-        means: of the Gaussian of every point.
+        means: of each point's Gaussian.
         center: of the camera.
         min_cos: between normal and ray; a more grazing view does not show where along it the plane lies.
     """
@@ -54,12 +54,12 @@ def depth_errors(
 
 
 def image_plane(points: Float[Array, "p 3"]) -> Float[Array, "p 2"]:
-    """(x/z, y/z) of camera-frame points; of no meaning behind the camera."""
+    """Project camera-frame points to (x/z, y/z); arbitrary behind the camera."""
     return points[:, :2] / jnp.where(points[:, 2:] > 0, points[:, 2:], 1.0)
 
 
 def node_weights(points: Float[Array, "p 3"], low: Float[Array, "2"], high: Float[Array, "2"]) -> Float[Array, "p n n"]:
-    """Bilinear weights of the nodes at camera-frame points; beyond the last node its value goes on."""
+    """Compute bilinear weights of the nodes at camera-frame points; constant beyond the outermost nodes."""
     place = (image_plane(points) - low) / jnp.maximum(high - low, LEAST_SIDE)
     place = jnp.clip(place, 0.0, 1.0) * (NUM_NODES - 1)
     along = jnp.maximum(1.0 - jnp.abs(place[..., None] - jnp.arange(NUM_NODES)), 0.0)
@@ -74,23 +74,23 @@ def depth_field(
     valid: Bool[Array, "p"],
     length: Float[Array, ""],
 ) -> DepthField:
-    """Estimate the field of a frame from how far its points are from the map, as a Gaussian process on the nodes.
+    """Estimate the field of a frame's depth errors as a Gaussian process on the nodes.
 
-    A network errs by a scale that drifts and by a field that is smooth over the image, ρ = B f + noise, with bilinear
-    weights B. The precision W of each point is Cauchy's, 1 / (σ² + (ρ - B f)²/4), over the number of points that err
-    alike:
+    A network's error is a scale that drifts and a field that is smooth over the image, ρ = B f + noise, with bilinear
+    weights B. The precision W of each point is Cauchy's, 1 / (σ² + (ρ - B f)²/4), divided by the number of points that
+    share an error:
 
         f = K (1 + B'WB K)⁻¹ B'W ρ,   K = v exp(-½ |i - j|² / length²)
 
-    v is the variance of the nodes' weighted means beyond that by chance.
-    Where errors are not alike v is 0, and nothing is corrected. The matching with the map is the caller's.
+    v is the variance of the nodes' weighted means in excess of chance. Without similar errors v is 0, and nothing is
+    corrected. The caller matches points and map.
 
     Args:
         points: camera frame.
-        errors: ρ, log of each point's depth over that of the map along its ray.
-        noise: σ of each error, that of the field included: a field has to be clear of it.
+        errors: ρ, log-ratio of each point's depth to that of the map along its ray.
+        noise: σ of each error, including that of the field, which must exceed it clearly.
         valid: which errors are known.
-        length: over which the field is alike, as a fraction of the image's side.
+        length: correlation length of the field, as a fraction of the image's side.
     """
     is_before = valid & (points[:, 2] > 0)
     plane = image_plane(points)
@@ -124,7 +124,7 @@ def depth_field(
 
 
 def field_at(field: DepthField, points: Float[Array, "p 3"]) -> Float[Array, "p"]:
-    """f where camera-frame points are seen; 0 behind the camera."""
+    """Evaluate f at camera-frame points; 0 behind the camera."""
     weights = node_weights(points, field.low, field.high)
     return jnp.where(points[:, 2] > 0, jnp.einsum("pij,ij->p", weights, field.nodes), 0.0)
 
@@ -133,7 +133,7 @@ def field_at(field: DepthField, points: Float[Array, "p 3"]) -> Float[Array, "p"
 def moved_by_field(
     points: Float[Array, "p 3"], field: DepthField, share: Float[Array, ""], T_world_camera: jaxlie.SE3
 ) -> Float[Array, "p 3"]:
-    """Move world-frame points that the camera sees between the outermost nodes: x <- x + (x - c) (exp(f share) - 1)."""
+    """Move world-frame points seen between the outermost nodes: x <- x + (x - c) (exp(f share) - 1)."""
     rays = points - T_world_camera.translation()
     seen = rays @ T_world_camera.rotation().as_matrix()
     plane = image_plane(seen)

@@ -1,4 +1,4 @@
-"""ICP against Gaussians as one Levenberg–Marquardt solve."""
+"""ICP against Gaussians by Levenberg–Marquardt."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -36,7 +36,7 @@ from emgs_jax.registration.problem import (
     residuals,
 )
 
-MIN_COS = 0.3  # of a point's ray and its Gaussian's normal, for its depth error to be known
+MIN_COS = 0.3  # between a point's ray and its Gaussian's normal; below it the depth error is unknown
 
 _Carry: TypeAlias = tuple[Float[Array, "7"], Uncertainty]
 
@@ -46,19 +46,19 @@ class IcpInfo(eqx.Module):
 
     Args:
         num_inliers: points with a Gaussian that passes the gates.
-        inlier_fraction: of the points that take part.
+        inlier_fraction: num_inliers over the points that take part.
         residual: root mean square distance of the inliers to their Gaussians' planes, as a fraction of their depth.
         misfit: the same fraction of all points within `max_misfit`, as 1.4826 times the median, a robust standard
             deviation; 0 without any.
-        misfit_of_levels: likewise of the points in each level of confidence.
-        level_edges: where these levels end.
-        information: of the points alone, of (xi, log s).
-        num_effective: how many independent measurements the points are worth, see `num_independent`.
-        min_eigenvalue: of the pose's information by prior, planes and colours together, for translations in median
-            depths and rotations in rad: the variance of its least certain direction is one over it.
+        misfit_of_levels: likewise for the points in each level of confidence.
+        level_edges: upper confidences of these levels.
+        information: of the points alone, about (xi, log s).
+        num_effective: number of independent measurements that the points amount to, see `num_independent`.
+        min_eigenvalue: of the pose's information from prior, planes and colours, for translations in median depths and
+            rotations in rad; its inverse is the variance of the least certain direction.
         field: of the frame's depth errors, see `depth_field`.
         num_steps: of all solves.
-        is_converged: False where the last solve reached `max_steps` or failed.
+        is_converged: False if the last solve reached `max_steps` or failed.
     """
 
     num_inliers: Int[Array, ""]
@@ -86,7 +86,7 @@ def _observed(
     """Estimate the uncertainty from the points' distances to their Gaussians; `noise` is its lower bound.
 
     Returns:
-        The uncertainty, the distances as fractions of the depth, and their spread: of all points, and of each level.
+        The uncertainty, the distances as fractions of the depth, and their spread over all points and in each level.
     """
     source = problem.source
     distance, is_near = distances(y, matches, problem, config)
@@ -108,19 +108,19 @@ def _search_and_solve(
     noise: Float[Array, ""],
     config: IcpConfig,
 ) -> tuple[_Carry, tuple[Candidates, Int[Array, ""], Bool[Array, ""]]]:
-    """Look up the Gaussians near every point, see how well the points fit them, and solve for y from there.
+    """Look up the Gaussians near every point, measure how well the points fit them, and solve for y from there.
 
     Args:
-        look: whether the misfit here is that of the coarse pose, and that of the points.
+        look: whether the misfit measured here counts for the coarse pose, and whether for the points.
     """
     (y, before), (is_first, is_new) = carry, look
     problem = problem_of(before)
     candidates = candidates_at(y, problem, config)
     seen, _, _ = _observed(y, matches_at(y, candidates, problem, config), levels, problem, noise, config)
-    # y is the coarse pose at first, and only then do the distances say what that is worth.
+    # Only at first is y the coarse pose; only then do the distances measure its quality.
     common = jnp.where(is_first, seen.common, before.common)
     uncertainty = jax.tree.map(partial(jnp.where, is_new), replace(seen, common=common), replace(before, common=common))
-    # Seven unknowns: on a CPU the normal equations take a fraction of a QR of all rows.
+    # For seven unknowns, normal equations take a fraction of the time of a QR of all rows on a CPU.
     solver = optx.LevenbergMarquardt(
         rtol=config.tolerance, atol=config.tolerance, linear_solver=lineax.Normal(lineax.Cholesky())
     )
@@ -132,7 +132,7 @@ def _search_and_solve(
 
 
 def _field(T: jaxlie.SE3, scale: Float[Array, ""], matches: Matches, problem: Problem, config: IcpConfig) -> DepthField:
-    """The smooth part of what the points differ from their Gaussians, also of those too far from them to fit."""
+    """Estimate the smooth part of the points' difference from their Gaussians, including points too far to fit."""
     placed = transform(T, problem.source, scale)
     errors, is_known = depth_errors(placed.points, matches.means, matches.normals, T.translation(), MIN_COS)
     is_known &= placed.valid & (jnp.abs(errors) < config.max_field)
@@ -147,22 +147,21 @@ def icp(
     config: IcpConfig,
     index: GaussianIndex | None = None,
 ) -> tuple[jaxlie.SE3, Float[Array, ""], IcpInfo]:
-    """Place camera-frame `source` on `target`: argmin over xi and s of data + prior, T = T_world_coarse exp(xi).
+    """Register camera-frame `source` to `target`: argmin over xi and s of data + prior, T = T_world_coarse exp(xi).
 
-    The data term is a truncated least-squares sum over the points, scaled so that all of them together weigh as much
-    as `num_effective` independent ones. The prior holds xi at 0 and the scale s of the points about the camera at 1 by
-    what `start` knows: the predictions of one call share an error of scale, and only the map remembers the scale of the
-    calls before.
+    The data term is a truncated least-squares sum over the points, scaled to the weight of `num_effective` independent
+    points. The prior pulls xi to 0 and the scale s of the points about the camera to 1, as strongly as `start` says:
+    the predictions of one call share an error of scale, and only the map remembers the scale of earlier calls.
 
-    Its noise is a lower bound. Where the points do not fit the map at the coarse pose as well as that, the coarse pose
-    is worth no more than they fit there, and the depths no more than they fit where they are looked up: a prior may
-    repeat itself exactly and still err. A pose that is given with its uncertainty keeps that: where its points do not
-    fit, the error is theirs.
+    The noise in `start` is a lower bound, because a prior may repeat itself exactly and still be wrong. If the points
+    fit the map less well than that at the coarse pose, the coarse pose is trusted less; if they fit less well where
+    they are looked up, so are the depths. A pose with a stated uncertainty keeps it: if its points do not fit, the
+    error is theirs.
 
     Args:
         source: points to align, camera frame.
         target: Gaussians of the submap, world frame.
-        index: of the target; None makes it here.
+        index: of the target; None builds it here.
 
     Returns:
         T_world_camera, the scale, and what the solve found.

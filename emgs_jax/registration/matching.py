@@ -17,7 +17,7 @@ Candidates: TypeAlias = tuple[Int[Array, "p k"], Bool[Array, "p k"]]  # of `near
 
 
 class Surface(eqx.Module):
-    """Gaussians with what is computed once for all comparisons with them.
+    """Gaussians with everything that is computed once for all comparisons.
 
     Args:
         gaussians: n of them, world frame.
@@ -37,9 +37,9 @@ class Surface(eqx.Module):
 
 
 class Matches(eqx.Module):
-    """The Gaussian of every point: its surface's rows, the point's whitened noise, and whether the two agree.
+    """The Gaussian of every point, the point's whitened noise, and whether the two agree.
 
-    `plane_std` (m) has the point's noise in it, `plane_vars` (m²) has not.
+    `plane_std` (m) includes the point's noise, `plane_vars` (m²) does not.
     """
 
     means: Float[Array, "p 3"]
@@ -59,9 +59,9 @@ def surface_of(
     num_color_neighbours: int,
     index: GaussianIndex | None = None,
 ) -> Surface:
-    """Index (made here where it is None), thickness and colour gradients, which are zero unless `has_color`."""
+    """Compute index (if None), thickness and colour gradients (zero unless `has_color`)."""
     index = index_of(gaussians) if index is None else index
-    # Only where colour counts: the gradients cost a neighbour search over the submap.
+    # Only if colour is used: the gradients cost a neighbour search over the submap.
     gradients = jax.lax.cond(
         has_color,
         lambda: color_gradients(gaussians, num_color_neighbours, index.groups),
@@ -84,7 +84,7 @@ def match(
     surface: Surface,
     gates: tuple[Float[Array, ""], Float[Array, ""]],
 ) -> Matches:
-    """For each point the nearest of its candidates in Mahalanobis distance.
+    """Match each point to the nearest of its candidates in Mahalanobis distance.
 
     Args:
         points: p of them, world frame.

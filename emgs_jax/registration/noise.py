@@ -1,4 +1,4 @@
-"""Noise of points, estimated from themselves: by level of the prior's confidence, and how many are independent."""
+"""Noise of points, estimated from the points: per level of the prior's confidence, and how many are independent."""
 
 import jax
 import jax.numpy as jnp
@@ -9,37 +9,37 @@ from emgs_jax.ops.ranks import kth_smallest
 from emgs_jax.registration.rigid import MIN_PAIRS, median
 
 NUM_LEVELS = 8  # of confidence
-NUM_CELLS = 4  # along each side of the image, whose errors are compared; few, for errors may be alike over much of it
+NUM_CELLS = 4  # along each side of the image, whose errors are compared; few, as errors may be similar over much of it
 
 
 def level_edges(confidence: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, "l"]:
-    """The confidences that part the valid points into eighths: the largest of each level but the last.
+    """Find the confidences that divide the valid points into eighths: the largest of each level but the last.
 
-    Only the order counts, since networks mean different things by their numbers. NaN without a valid point.
+    Only the order counts, because networks use different scales. NaN without a valid point.
     """
     share = jnp.arange(1, NUM_LEVELS) * jnp.sum(valid)
     return kth_smallest(confidence, valid, -(-share // NUM_LEVELS) - 1)
 
 
 def levels_of(confidence: Float[Array, "p"], edges: Float[Array, "l"]) -> Int[Array, "p"]:
-    """The level of confidence of every point, 0 the lowest.
+    """Find the level of confidence of every point, 0 the lowest.
 
-    Equal confidences have equal levels: with a constant one all points have level 0.
+    Equal confidences have equal levels: if all are equal, all points have level 0.
     """
     return jnp.sum(confidence[:, None] > edges, axis=-1)
 
 
 def robust_std(errors: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
-    """`MAD_TO_STD` times the median absolute error, the standard deviation of Gaussian errors; 0 without any."""
+    """Compute a robust standard deviation: `MAD_TO_STD` times the median absolute error; 0 without any."""
     return jnp.where(jnp.any(valid), MAD_TO_STD * median(jnp.abs(errors), valid), 0.0)
 
 
 def noise_of_levels(
     errors: Float[Array, "p"], valid: Bool[Array, "p"], levels: Int[Array, "p"]
 ) -> tuple[Float[Array, ""], Float[Array, "l"]]:
-    """`robust_std` of all errors, and of those in every level; there that of all where a level has too few.
+    """Compute `robust_std` of all errors and of each level's; a level with too few takes that of all.
 
-    So a confidence that is wrong about its points is found out by their errors.
+    This way the errors, not the confidence itself, decide how noisy a level is.
     """
     chosen = valid & jnp.append(levels == jnp.arange(NUM_LEVELS)[:, None], jnp.ones_like(valid)[None], axis=0)
     *of_levels, of_all = jax.vmap(robust_std, (None, 0))(errors, chosen)
@@ -50,11 +50,11 @@ def noise_of_levels(
 def num_independent(
     errors: Float[Array, "p"], points: Float[Array, "p 3"], valid: Bool[Array, "p"]
 ) -> Float[Array, ""]:
-    """Estimate how many independent measurements the points are worth, as errors of neighbouring points correlate.
+    """Estimate how many independent measurements the points amount to, as errors of neighbouring points correlate.
 
-    The image is cut into cells. The variance of the cells' mean errors is that of all errors where the points of a cell
-    err alike, and falls with their number where they do not: cells · var(errors) / var(means), between the number of
-    cells and that of points. Without any valid point it is that of cells.
+    The image is cut into cells. If the points of a cell share an error, the variance of the cells' means equals that of
+    all errors; if not, it falls with their number. The estimate is cells · var(errors) / var(means), between the number
+    of cells and the number of points; without a valid point it is the number of cells.
 
     Args:
         errors: in standard deviations.

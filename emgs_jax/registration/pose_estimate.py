@@ -1,8 +1,8 @@
 """Estimate of a frame's pose and scale: prediction and correction of a Kalman filter from frame to frame.
 
 The error of a pose T and a scale s, relative to the map, is T Exp(ξ) and s e^σ with (ξ, σ) ~ N(0, P), in the order
-translation (m), rotation (rad), logarithm of the scale. The errors of the map itself are no part of it; where a frame
-is relative to the first one, `mapping/run.py` says.
+translation (m), rotation (rad), logarithm of the scale. Errors of the map itself are not included; at the
+end of a run `mapping/finalize.py` adds those of the first frame.
 """
 
 import equinox as eqx
@@ -21,15 +21,15 @@ DEGREES = 7
 
 
 class PoseEstimate(eqx.Module):
-    """Estimate from the last frame that the next step starts from, beside the pose itself.
+    """Estimate from the last frame, from which the next step starts, besides the pose itself.
 
     Args:
         covariance: P of its pose and scale, relative to the map.
-        depth_noise: how much its points differ from the map, as a fraction of their depth.
+        depth_noise: difference between its points and the map, as a fraction of their depth.
         log_scale: mean logarithm of the scales of the tracked frames: the prior's own unit, in that of the map.
         repeats: differences between repeated predictions of one pose.
-        is_given: the prior says itself how sure it is of this frame's pose. Then its poses lie in one world, whose unit
-            is theirs, and how well points fit says nothing of them.
+        is_given: the prior states the uncertainty of this frame's pose. Then its poses lie in one world with one unit,
+            and how well points fit says nothing about them.
     """
 
     covariance: Float[Array, "*b 7 7"]
@@ -41,7 +41,7 @@ class PoseEstimate(eqx.Module):
 
 
 def exact_estimate() -> PoseEstimate:
-    """Return the estimate of the frame that the map is made of: its pose is exact, and its scale is the unit."""
+    """Return the estimate of the frame that makes the map: its pose is exact, and its scale is the unit."""
     return PoseEstimate(jnp.zeros((DEGREES, DEGREES)), *jnp.zeros((2,)), jnp.ones(()), no_repeats(), jnp.asarray(False))
 
 
@@ -49,10 +49,10 @@ def exact_estimate() -> PoseEstimate:
 def propagate_covariance(
     covariance: Float[Array, "7 7"], T_previous_current: jaxlie.SE3, noise: Float[Array, "7 7"]
 ) -> Float[Array, "7 7"]:
-    """P of the current frame: A P A' + Q, with A the adjoint of the motion's inverse, and Q the covariance `noise`.
+    """Propagate P to the current frame: A P A' + Q, with A the adjoint of the motion's inverse and Q = `noise`.
 
-    What the scale's error does to the length of the motion is left out: it is small against `noise`.
-    A motion that is not finite counts as none.
+    The effect of the scale's error on the length of the motion is neglected: it is small against `noise`. A motion that
+    is not finite counts as none.
     """
     adjoint = T_previous_current.inverse().adjoint()
     adjoint = jnp.where(jnp.all(jnp.isfinite(adjoint)), adjoint, jnp.eye(DEGREES - 1))
@@ -64,15 +64,15 @@ def propagate_covariance(
 def kalman_update(
     covariance: Float[Array, "7 7"], difference: Float[Array, "7"], information: Float[Array, "7 7"]
 ) -> tuple[Float[Array, "7"], Float[Array, "7 7"]]:
-    """Correct an estimate by a measurement: step (ξ, σ) of the mean, and P: (P⁻¹ + W)⁻¹ W d and (P⁻¹ + W)⁻¹.
+    """Correct an estimate by a measurement: the step (ξ, σ) of the mean, (P⁻¹ + W)⁻¹ W d, and the new P, (P⁻¹ + W)⁻¹.
 
     Args:
         covariance: P, which may be singular.
         difference: d, the innovation: the measurement relative to the estimate.
-        information: W of the measurement; zero where nothing is measured.
+        information: W of the measurement; zero in directions that are not measured.
     """
     root = _root(covariance)
-    # As a square, which stays a covariance however well P and W are known in different directions.
+    # As a square, which remains a covariance however much P and W differ between directions.
     inner = jnp.linalg.cholesky(jnp.eye(DEGREES) + root.T @ information @ root)
     half = jax.scipy.linalg.solve_triangular(inner, root.T, lower=True)
     posterior = half.T @ half
@@ -109,12 +109,12 @@ def correct(
 
 @full_precision
 def root_information(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """L⁻¹ of P = L L': |L⁻¹ x|² is the squared Mahalanobis distance of x. No variance of P may be 0."""
+    """Compute L⁻¹ of P = L L': |L⁻¹ x|² is the squared Mahalanobis distance of x. No variance of P may be 0."""
     return jax.scipy.linalg.solve_triangular(_root(covariance), jnp.eye(covariance.shape[0]), lower=True)
 
 
 def _root(covariance: Float[Array, "d d"]) -> Float[Array, "d d"]:
-    """L of P = L L', by correlations, so that no unit rounds another one."""
+    """Factor P = L L' by its correlations, so that units of different size do not round each other."""
     variances = jnp.diagonal(covariance)
     std = jnp.sqrt(jnp.where(variances > 0, variances, 1.0))
     correlation = covariance / std / std[:, None] + ROUNDED_CORRELATION * jnp.eye(std.shape[0])
@@ -130,28 +130,28 @@ def correct_by_points(
     is_tracked: Bool[Array, ""],
     num_alike: Float[Array, ""],
 ) -> tuple[PoseEstimate, Float[Array, "6 6"]]:
-    """Correct the estimate by the points of a frame; it stays as it is where the frame is not tracked.
+    """Correct the estimate by the points of a frame; it stays unchanged if the frame is not tracked.
 
     Args:
         found: result of ICP.
         depth_noise: expected, as a fraction of the depth, see `pose_worth`.
-        num_alike: frames that see one part of the map, which is wrong for all of them in the same way: the information
-            of one frame's points about the scale is divided by it.
+        num_alike: frames that see one part of the map, whose error they share: the information of one frame's points
+            about the scale is divided by it.
 
     Returns:
-        The estimate, and the part of an error of the map that is in the pose: the gain of the points where the prior
-        knows the pose by itself, and else all of it, for the estimate is relative to the map.
+        The estimate, and the share of an error of the map that enters the pose: the points' gain if the prior knows the
+        pose by itself, otherwise all of it, because the estimate is relative to the map.
     """
     worth, nothing = pose_worth(estimate.is_given, found.misfit, depth_noise), jnp.zeros(DEGREES)
     units = jnp.ones(DEGREES).at[-1].set(num_alike**-0.5)
     information = units[:, None] * found.information * units
     _, covariance = kalman_update(worth[:, None] * estimate.covariance * worth, nothing, information)
     gain = jnp.where(is_tracked, (covariance @ information)[:-1, :-1], 0.0)
-    # Of given poses the unit is known, whatever the scales of the depths.
+    # Poses with a stated uncertainty have a known unit, whatever the scales of the depths.
     num_scales = estimate.num_scales + jnp.where(estimate.is_given, 0.0, 1.0)
     change = jnp.where(estimate.is_given, 0.0, jnp.log(scale) - estimate.log_scale)
     log_scale = estimate.log_scale + change / num_scales
-    # Predicted poses are repeated predictions of the next frame, whether the points fit or not.
+    # The next frame repeats these predicted poses, whether the points fit or not.
     estimate = eqx.tree_at(lambda b: b.repeats, estimate, rescale_repeats(estimate.repeats, scale))
     after = PoseEstimate(covariance, found.misfit, log_scale, num_scales, estimate.repeats, estimate.is_given)
     after = jax.tree.map(lambda new, old: jnp.where(is_tracked, new, old), after, estimate)

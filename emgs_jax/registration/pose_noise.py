@@ -1,10 +1,10 @@
-"""Noise of the prior's poses, estimated from how much two of its predictions of the same pose differ.
+"""Noise of the prior's poses, estimated from the difference between two predictions of the same pose.
 
-In the prediction before the current one, the current frame was the newest and the previous frame the current one: it
-has the motion of the camera between the two, and the previous pose relative to the anchor. The current prediction has
-both again. Depths show less: a prior may keep those of an image, and one that solves for poses knows them better than
-any depth. Two predictions that are equal up to rounding are one prediction, of a prior that has one pose for a frame:
-its consistency is no evidence of its error, and the pose is as uncertain as without a repeated prediction.
+In the previous prediction, today's current frame was the newest and today's previous frame the current one. So it has
+the motion of the camera between the two, and the previous pose relative to the anchor. The current prediction has both
+again. Depths tell less: a prior may repeat those of an image, and one that solves for poses knows poses better than
+depths. Two predictions that are equal up to rounding are one prediction, of a prior that has one pose for a frame. Such
+consistency is no evidence of accuracy, and the pose is as uncertain as without a repeated prediction.
 """
 
 import equinox as eqx
@@ -20,19 +20,19 @@ from emgs_jax.registration.rigid import pose_row, scale_translation
 
 LOG_OF_SQUARE = -0.36898  # mean logarithm of χ²/3 with three degrees of freedom: ψ(3/2) - log(3/2)
 LEAST_NOISE = 2e-4  # of the depth; keeps the covariance of an exact prior regular
-NO_INFORMATION = 1e-6  # in place of 0
+NO_INFORMATION = 1e-6  # used instead of 0
 SMALLEST_SQUARE = 1e-14  # in a logarithm
-SAME_SQUARE = 1e-10  # of what one answer differs by from itself: rounding, of lengths up to a hundred mean depths
+SAME_SQUARE = 1e-10  # by which a prediction may differ from itself: rounding, for lengths up to a hundred mean depths
 
 
 class Repeats(eqx.Module):
     """Differences between repeated predictions so far; rows: motion to the next frame, pose relative to the anchor.
 
     Args:
-        predicted: both as last predicted, m of the map.
-        is_predicted: False where they were not predicted; `predicted` is the identity then.
-        log_squares: mean logarithm of the mean square, per axis, of the differences: of lengths in mean depths, angles.
-        counts: differences in that mean; a prediction that is the same again is not counted.
+        predicted: the last prediction of both, m of the map.
+        is_predicted: False if they were not predicted; `predicted` is then the identity.
+        log_squares: mean logarithm of the mean square difference per axis, of lengths in mean depths and of angles.
+        counts: number of differences in that mean; an identical prediction does not count.
     """
 
     predicted: jaxlie.SE3
@@ -42,7 +42,7 @@ class Repeats(eqx.Module):
 
 
 def no_repeats() -> Repeats:
-    """Return the repeats of the frame that the map is made of: none so far."""
+    """Return the repeats of the frame that makes the map: none so far."""
     return Repeats(jaxlie.SE3.identity((2,)), jnp.zeros(2, bool), jnp.zeros((2, 2)), jnp.zeros(2))
 
 
@@ -59,13 +59,14 @@ def repeat_poses(
     mean_depth: Float[Array, ""],
     max_count: Float[Array, ""],
 ) -> tuple[Repeats, Float[Array, "2 2"]]:
-    """Add the differences of this repeated prediction; return also their mean squares, 0 without new ones.
+    """Add the differences of this repeated prediction; also return their mean squares, 0 without new ones.
 
     Args:
-        before: differences until the last frame.
-        scale: of this prediction. The poses returned are in its own unit: `rescale_repeats` when the scale is final.
+        before: differences up to the last frame.
+        scale: of this prediction. The returned poses are in its own unit; call `rescale_repeats` once the scale is
+            final.
         mean_depth: of the previous frame, m of the map.
-        max_count: from this number of differences on older ones are forgotten.
+        max_count: number of differences from which on older ones are forgotten.
     """
     previous, current, newest = (pose_row(prediction.T_world_views, row) for row in range(3))
     anchor = prediction.T_world_anchor.inverse()
@@ -90,15 +91,15 @@ def repeat_poses(
 def pose_std(
     repeats: Repeats, latest: Float[Array, "2 2"], otherwise: Float[Array, ""], shared: Float[Array, ""]
 ) -> Float[Array, "2 2"]:
-    """Standard deviations per axis, of lengths and angles (columns), of the prior's motion and of its own pose (rows).
+    """Estimate standard deviations per axis, of length and angle (columns), of the prior's motion and own pose (rows).
 
-    Two answers of variance v that have the part c of it in common differ by the variance 2 (1 - c) v. The mean is one
-    of logarithms, and what was to be expected without any repeat counts like one of them: neither a turn on the spot
-    nor a first guess that is far off holds it. A pose whose own repeat differs by more is as uncertain as that.
+    Two predictions of variance v that share the part c of it differ by the variance 2 (1 - c) v. The mean is taken over
+    logarithms, and the value expected without any repeat counts as one of them. So neither a turn on the spot nor a bad
+    first guess dominates it. If a pose's own repeat differs by more, the pose is as uncertain as that.
 
     Args:
-        latest: of this answer alone, see `repeat_poses`.
-        otherwise: of both and each, without any repeat and for `shared` = 1.
+        latest: mean squares of this prediction alone, see `repeat_poses`.
+        otherwise: standard deviations without any repeat, and for `shared` = 1.
         shared: c.
     """
     differing, counts = 2.0 * jnp.maximum(1.0 - shared, 1e-6), repeats.counts[:, None]
@@ -109,7 +110,7 @@ def pose_std(
 
 
 def is_given_pose(prediction: Prediction) -> Bool[Array, ""]:
-    """True where the prior has a pose of the current frame and says how sure it is of it."""
+    """Tell whether the prior has a pose of the current frame and states its uncertainty."""
     pose = pose_row(prediction.T_world_views, 1).wxyz_xyz
     return jnp.all(jnp.isfinite(prediction.pose_covariance[1])) & jnp.all(jnp.isfinite(pose))
 
@@ -120,13 +121,13 @@ def pose_covariances(
     mean_depth: Float[Array, ""],
     unit: Float[Array, ""],
 ) -> Float[Array, "2 6 6"]:
-    """Covariances of the prior's motion and of its own pose, m and rad of the map.
+    """Compute covariances of the prior's motion and own pose, m and rad of the map.
 
-    What is given is no more certain than `LEAST_NOISE` of the depth, which keeps it regular.
+    Stated covariances have a floor of `LEAST_NOISE` of the depth, which keeps them regular.
 
     Args:
         given: see `Prediction.pose_covariance`.
-        otherwise: standard deviations of each axis, m of the map and rad, where nothing is given.
+        otherwise: standard deviations of each axis, m of the map and rad, if none are stated.
         mean_depth: m of the map.
         unit: of the prediction's poses, m of the map.
     """
@@ -145,13 +146,13 @@ def axis_std(
     information: Float[Array, ""],
     shared: Float[Array, ""],
 ) -> Float[Array, "2 6"]:
-    """`pose_std` of each axis, m and rad, in the order of ξ.
+    """Convert `pose_std` to m and rad for each axis, in the order of ξ.
 
     Args:
-        latest: of this answer alone.
+        latest: mean squares of this prediction alone.
         depth_noise: as a fraction of the depth.
         mean_depth: m of the map.
-        information: of a pose without any repeat, in that of depths with this noise (`prior_information`).
+        information: of a pose without any repeat, in units of depths with this noise (`prior_information`).
         shared: see `pose_std`.
     """
     root = jnp.sqrt(jnp.maximum(information, NO_INFORMATION))

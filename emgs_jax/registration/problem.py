@@ -1,4 +1,4 @@
-"""Cost function of ICP: the distances of points from Gaussians, in standard deviations, and the prior of the pose."""
+"""Cost function of ICP: distances of points from Gaussians in standard deviations, and the prior on the pose."""
 
 import math
 
@@ -18,8 +18,8 @@ from emgs_jax.registration.rigid import median
 
 RESIDUALS = ("colored", "distribution", "colored+distribution", "colored+ray")
 COLORED, DISTRIBUTION, _, COLORED_RAY = range(len(RESIDUALS))
-LEAST_PLANE = 1e-6  # distance of a plane from the camera, of that of the point before it
-LEAST_RATIO = 1e-3  # of a point's depth over that of a plane; less is behind the camera
+LEAST_PLANE = 1e-6  # smallest distance of a plane from the camera, as a fraction of the point's
+LEAST_RATIO = 1e-3  # of a point's depth to that of a plane; less is behind the camera
 
 
 class IcpConfig(eqx.Module):
@@ -30,23 +30,23 @@ class IcpConfig(eqx.Module):
             "Colored point cloud registration revisited", ICCV 2017); `distribution`: offset from the mean, whitened by
             the Gaussian's covariance; `colored+distribution`: offset and intensity difference; or `colored+ray`: depth
             along the viewing ray over that of the Gaussian's plane, and intensity difference.
-        noise: factor on the points' noise along their viewing rays, which widens every Gaussian for them.
-        max_misfit: fraction of the depth; a point farther from its Gaussian's plane shows something else, and says
-            nothing of the noise; 0 takes the noise as it is given.
-        max_mahalanobis_sq: a point farther from all its neighbours than this is no inlier.
-        min_normal_cos: nor one whose normal differs more from its Gaussian's.
-        prior_information: of the coarse pose, in units of one effective point as noisy as the coarse step shows;
-            0 = no prior, the printed form.
-        scale_noise: standard deviation of the logarithm of the scale about the coarse step's, in units of the points'
-            depth noise, where nothing else is known of it; 0 = no scale (printed).
-        max_field: of a logarithm of depth; what differs more from the map is another surface, and says nothing of the
-            field of a frame's depth errors; 0: none is sought (printed).
-        field_length: over which these errors are alike, as a fraction of the image's side.
-        num_points: how many points take part at least: every n-th of them, with the largest n that leaves so many.
-        num_searches: how often the Gaussians near every point are looked up, each time with a solve after it.
-        num_neighbours: Gaussians near a point, which every step of a solve compares.
-        num_color_neighbours: Gaussians from which a Gaussian's intensity gradient is fitted.
-        tolerance: relative and absolute, of the solver; float32 tells no smaller differences apart than the least.
+        noise: factor on the points' noise along their viewing rays, which widens the Gaussians they are compared with.
+        max_misfit: fraction of the depth; a point farther from its Gaussian's plane shows something else and does not
+            count in the noise; 0 uses the given noise.
+        max_mahalanobis_sq: a point farther than this from all its neighbours is no inlier.
+        min_normal_cos: nor is one whose normal differs more from its Gaussian's.
+        prior_information: of the coarse pose, in units of one effective point with the noise of the coarse step; 0 = no
+            prior, the printed form.
+        scale_noise: standard deviation of the log-scale about the coarse step's, in units of the points' depth noise,
+            if nothing else is known; 0 = no scale (printed).
+        max_field: of a logarithm of depth; a larger difference from the map is another surface and does not count in
+            the field of depth errors; 0: no field (printed).
+        field_length: correlation length of the field, as a fraction of the image's side.
+        num_points: least number of points: every n-th one takes part, with the largest n that leaves this many.
+        num_searches: how often the Gaussians near every point are looked up, each time followed by a solve.
+        num_neighbours: Gaussians near a point that every step of a solve compares.
+        num_color_neighbours: Gaussians to which a Gaussian's intensity gradient is fitted.
+        tolerance: relative and absolute, of the solver; its lower bound is the resolution of float32.
     """
 
     residual: Float[Array, "*b"] = choice(*RESIDUALS)
@@ -76,13 +76,13 @@ class Uncertainty(eqx.Module):
 
 
 class CoarseStart(eqx.Module):
-    """Start of ICP, and how much of that is known before it looks at the points.
+    """Start of ICP, and what is known before it looks at the points.
 
     Args:
-        T_world_coarse: also the mean of the pose.
-        root_information: root of the information of (xi, log s) where the points fit as well as they should.
-        noise: least standard deviation of the points' depth, as a fraction of it.
-        is_given: the prior itself says how sure it is of the pose, see `pose_worth`.
+        T_world_coarse: initial pose, and mean of the prior on it.
+        root_information: root of the information about (xi, log s) if the points fit as expected.
+        noise: smallest standard deviation of the points' depth, as a fraction of it.
+        is_given: the prior states the uncertainty of the pose, see `pose_worth`.
     """
 
     T_world_coarse: jaxlie.SE3
@@ -92,24 +92,24 @@ class CoarseStart(eqx.Module):
 
 
 class Problem(eqx.Module):
-    """Constants of the ICP problem while the pose moves; lengths in metres, unknowns in units of their own."""
+    """Constants of the ICP problem while the pose changes; lengths in metres, unknowns in units of their own."""
 
     source: Observation  # camera frame
     surface: Surface
     T_world_coarse: jaxlie.SE3
     depth_noise: Float[Array, "p"]  # of every point along its viewing ray, as a fraction
-    units: Float[Array, "7"]  # of (xi, log s) for one of the unknowns; 0 for a scale that stays
+    units: Float[Array, "7"]  # (xi, log s) per unit of an unknown; 0 for a fixed scale
     prior: Float[Array, "7 7"]  # root of the information of the coarse pose and scale, by the unknowns
     weight: Float[Array, ""]  # of a point
 
 
 def pose_worth(is_given: Bool[Array, ""], misfit: Float[Array, ""], depth_noise: Float[Array, ""]) -> Float[Array, "7"]:
-    """Return the factors on the standard deviations of a coarse pose and scale whose points do not fit as they should.
+    """Return factors on the standard deviations of a coarse pose and scale whose points do not fit as expected.
 
-    Of a pose that comes with its uncertainty the points' misfit says nothing.
+    The misfit says nothing about a pose with a stated uncertainty.
 
     Args:
-        is_given: the prior itself says how sure it is of the pose.
+        is_given: the prior states the uncertainty of the pose.
         misfit: of the points, as a fraction of the depth.
         depth_noise: expected, likewise.
     """
@@ -126,14 +126,14 @@ def pose_problem(
 ) -> Problem:
     """Build the ICP problem of points and map.
 
-    Translation counts in the median depth, so that the solver's damping and tolerance mean the same in every unit of
-    length, and the seventh unknown in the depth noise.
+    Translation is measured in median depths, so that the solver's damping and tolerance mean the same in every unit of
+    length, and the seventh unknown in units of the depth noise.
     """
     depth = median(source.points[:, 2], source.valid)
     units = jnp.ones(7).at[:3].set(depth).at[6].set(config.scale_noise * start.noise)
     worth = pose_worth(start.is_given, uncertainty.common, start.noise)
     prior = (config.prior_information > 0) * start.root_information * units / worth
-    prior = prior.at[6, 6].set(jnp.where(units[6] * prior[6, 6] > 0, prior[6, 6], 1.0))  # a scale that stays
+    prior = prior.at[6, 6].set(jnp.where(units[6] * prior[6, 6] > 0, prior[6, 6], 1.0))  # a fixed scale
     return Problem(
         source=source,
         surface=surface,
@@ -146,20 +146,20 @@ def pose_problem(
 
 
 def pose_of(y: Float[Array, "7"], problem: Problem) -> tuple[jaxlie.SE3, Float[Array, ""]]:
-    """T_world_coarse exp(xi), and the scale, for the unknowns y."""
+    """Compute T_world_coarse exp(xi) and the scale from the unknowns y."""
     step = problem.units * y
     return problem.T_world_coarse @ jaxlie.SE3.exp(step[:6]), jnp.exp(step[6])
 
 
 def candidates_at(y: Float[Array, "7"], problem: Problem, config: IcpConfig) -> Candidates:
-    """The Gaussians near every point, placed by the unknowns y."""
+    """Look up the Gaussians near every point at the pose of y."""
     T, scale = pose_of(y, problem)
     surface, points = problem.surface, transform(T, problem.source, scale).points
     return nearest(points, problem.source.valid, surface.gaussians.means, surface.groups, config.num_neighbours)
 
 
 def matches_at(y: Float[Array, "7"], candidates: Candidates, problem: Problem, config: IcpConfig) -> Matches:
-    """The Gaussian of every point at y."""
+    """Match every point to a Gaussian at the pose of y."""
     T, scale = pose_of(y, problem)
     rays = problem.depth_noise[:, None] * problem.source.points
     placed, noise = transform(T, problem.source, scale), rays @ T.rotation().as_matrix().T
@@ -169,7 +169,7 @@ def matches_at(y: Float[Array, "7"], candidates: Candidates, problem: Problem, c
 def distances(
     y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig
 ) -> tuple[Float[Array, "p"], Bool[Array, "p"]]:
-    """Of every point to the plane of its Gaussian, as a fraction of its depth, and which show the same surface."""
+    """Measure each point's distance to its Gaussian's plane, as a fraction of its depth, and which pairs agree."""
     T, scale = pose_of(y, problem)
     placed = transform(T, problem.source, scale)
     depth = jnp.where(placed.valid, scale * problem.source.points[:, 2], 1.0)
@@ -180,12 +180,12 @@ def distances(
 def residuals(
     y: Float[Array, "7"], args: tuple[Candidates, Problem, IcpConfig]
 ) -> tuple[Float[Array, "p 5"], Float[Array, "7"]]:
-    """Rows of every point and of the prior, in standard deviations.
+    """Compute the rows of every point and of the prior, in standard deviations.
 
-    The matches carry no gradient. The derivative is made here, once, and the solver gets rows that are linear in y:
-    otherwise each of its uses of the derivative would be compiled, and computed, anew. So the derivatives of a solution
-    are Gauss-Newton's as well: they leave out the residuals times the derivatives of their Jacobian, and are right
-    where points fit their Gaussians.
+    The matches carry no gradient. The derivative is computed here, once, and the solver gets rows that are linear in y;
+    otherwise each of its uses of the derivative would be compiled and computed again. So the derivatives of a solution
+    are those of Gauss-Newton, too: they neglect the residuals times the derivatives of their Jacobian, and are right if
+    points fit their Gaussians.
     """
     candidates, problem, config = args
     fixed = jax.lax.stop_gradient(y)
@@ -196,7 +196,7 @@ def residuals(
 
 
 def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig) -> Float[Array, "p 5"]:
-    """Plane or ray, colour and whitened offset of every point for given matches, in standard deviations."""
+    """Compute every point's rows for given matches: plane or ray, colour, whitened offset; in standard deviations."""
     T, scale = pose_of(y, problem)
     placed = transform(T, problem.source, scale)
     offset = placed.points - matches.means
@@ -204,11 +204,11 @@ def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: Ic
     plane, ray = distance / matches.plane_std, _along_ray(distance, T, matches, problem)
     light = matches.light + jnp.sum(matches.gradients * offset, axis=-1)
     shade = (light - intensity(placed.colors)) / config.color_std
-    # The noise is the prediction's and grows with its scale; else a scale that shrinks all noisy points fits best.
+    # The noise grows with the prediction's scale; otherwise shrinking all noisy points would fit best.
     noise = scale * matches.noise
     triangle, noise, entries = (jnp.unstack(rows, axis=-1) for rows in (matches.triangle, noise, offset))
     white = jnp.stack(widen(whiten(triangle, entries), noise), axis=-1)
-    # A point beyond the gate costs what it would at the gate and pulls nowhere.
+    # A point beyond the gate has the constant cost of one at the gate, and no gradient.
     edge = jnp.sqrt(config.max_mahalanobis_sq)
     is_inlier = matches.is_inlier[:, None]
     has_plane, has_ray = config.residual == COLORED, config.residual == COLORED_RAY
@@ -226,11 +226,11 @@ def rows_of(y: Float[Array, "7"], matches: Matches, problem: Problem, config: Ic
 
 
 def _along_ray(distance: Float[Array, "p"], T: jaxlie.SE3, matches: Matches, problem: Problem) -> Float[Array, "p"]:
-    """log of a point's depth over that at which its ray meets its Gaussian's plane, in standard deviations.
+    """Compute the log-ratio of a point's depth to that of its Gaussian's plane along the ray, in standard deviations.
 
-    A prediction errs by a factor along the ray, and this is that factor's logarithm. Its derivatives by scale and
-    rotation have only the ray's direction in them. Those of `distance` have the point itself, and with it the very
-    error that they are multiplied by: in the mean that shrinks a frame by the square of its depth noise (errors in
+    A prediction is wrong by a factor along the ray; this is the factor's logarithm. Its derivatives by scale and
+    rotation depend only on the ray's direction. Those of `distance` depend on the point itself, and so on the very
+    error that they are multiplied by, which on average shrinks a frame by the square of its depth noise (errors in
     variables).
     """
     depth = jnp.sum((matches.means - T.translation()) * matches.normals, axis=-1)  # of the plane, along its normal
@@ -243,7 +243,7 @@ def _along_ray(distance: Float[Array, "p"], T: jaxlie.SE3, matches: Matches, pro
 def information_of_rows(
     y: Float[Array, "7"], matches: Matches, problem: Problem, config: IcpConfig
 ) -> Float[Array, "7 7"]:
-    """J'J of the points' rows by (xi, log s) about y; 0 for the scale where it is no unknown."""
+    """Compute J'J of the points' rows by (xi, log s) at y; 0 for a fixed scale."""
     units = problem.units
     jacobian = jax.jacfwd(rows_of)(y, matches, problem, config).reshape(-1, 7)
     jacobian = jnp.where(units > 0, jacobian / jnp.where(units > 0, units, 1.0), 0.0)
@@ -255,8 +255,8 @@ def information_of_surface(
 ) -> Float[Array, "6 6"]:
     """Compute the inliers' information about xi by planes and colours: w Σ j j' with j = (a, x × a) / std.
 
-    w is the weight of a point, a is the normal, or the gradient of the intensity, and x the point, both in the camera's
-    axes. Offsets from means do not count: the mean of a Gaussian is no landmark of its surface.
+    w is the weight of a point, a the normal or the gradient of the intensity, and x the point, both in the camera's
+    axes. Offsets from means do not count: the mean of a Gaussian is no landmark on its surface.
     """
     points, to_camera = scale * problem.source.points, T.rotation().as_matrix()
     normals, gradients = matches.normals @ to_camera, matches.gradients @ to_camera
@@ -268,10 +268,10 @@ def information_of_surface(
 
 
 def least_information(points: Float[Array, "6 6"], problem: Problem) -> Float[Array, ""]:
-    """Smallest eigenvalue of the information about the pose, in the units of the unknowns.
+    """Compute the smallest eigenvalue of the information about the pose, in units of the unknowns.
 
     Args:
-        points: their information about xi, to which that of the prior is added.
+        points: their information about xi; that of the prior is added.
     """
     units, prior = problem.units[:6], problem.prior[:, :6]
     return jnp.maximum(jnp.linalg.eigvalsh(units[:, None] * points * units + prior.T @ prior)[0], 0.0)

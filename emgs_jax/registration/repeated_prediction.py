@@ -1,4 +1,4 @@
-"""Scale, trust in the prior and poses from a repeated prediction: two windows predict the same image."""
+"""Scale, noise and poses from a repeated prediction: two windows predict the same image."""
 
 import jax
 import jax.numpy as jnp
@@ -12,7 +12,7 @@ from emgs_jax.ops.pytree import stack
 from emgs_jax.registration.noise import num_independent, robust_std
 from emgs_jax.registration.rigid import MIN_PAIRS, fit_rigid, fit_rigid_robust, median, pose_row
 
-LEAST_RATIO = 1e-6  # of a pixel's ratio of depths over their median; less is behind the camera
+LEAST_RATIO = 1e-6  # of a pixel's ratio of depths to their median; less is behind the camera
 
 
 @full_precision
@@ -23,15 +23,15 @@ def repeat_scale(
     otherwise: Float[Array, ""],
     reading: Float[Array, ""],
 ) -> tuple[Float[Array, ""], Float[Array, ""]]:
-    """Estimate a prediction's scale relative to the map, and its error, from an image's repeated prediction (R8).
+    """Estimate a prediction's scale relative to the map, and its error, from the repeated prediction of an image (R8).
 
-    The second value is the standard deviation of the scale's logarithm: that of the pixels' ratios over the root of
-    their number of independent ones, times √(π/2) for a median. 0 where an image is predicted the same to the bit.
+    The second value is the standard deviation of the log-scale: that of the pixels' log-ratios divided by the root of
+    the number of independent ones, times √(π/2) for a median. It is 0 if both predictions are equal to the bit.
 
     Args:
-        now: its prediction of this call, camera frame.
-        before: that of the call before as it was aligned with the map, world frame.
-        otherwise: scale where there are too few pairs.
+        now: this call's prediction of the image, camera frame.
+        before: the previous call's, aligned with the map, world frame.
+        otherwise: scale with too few pairs.
         reading: row of `LocalizationConfig.coarse_scale`: 0 (1, as printed), 1 (median ratio of depths) or 2 (of the
             similarity that fits best).
     """
@@ -53,7 +53,7 @@ def repeat_scale(
 
 
 def mean_depth_of(prediction: Prediction) -> Float[Array, ""]:
-    """Median depth of the previous image, in the prediction's unit; of the current one where that shows nothing."""
+    """Compute the median depth of the previous image, or of the current one if that has none; the prediction's unit."""
     views = prediction.previous, prediction.current
     depths = [view.points[:, 2] for view in views]
     known = [view.valid & (depth > NEAREST_DEPTH) for view, depth in zip(views, depths, strict=True)]
@@ -69,7 +69,7 @@ def repeat_error(
     scale: Float[Array, ""],
     otherwise: Float[Array, ""],
 ) -> Float[Array, ""]:
-    """Return the robust standard deviation, m, between two predictions of one image; `otherwise` without a pair."""
+    """Compute the robust standard deviation (m) between two predictions of an image; `otherwise` without a pair."""
     paired = now.valid & before.valid
     apart = transform(T_world_previous, now, scale).points - before.points
     differs = jnp.any(apart != 0, axis=-1)  # a length has no gradient where it is 0
@@ -87,13 +87,13 @@ def through_previous(
     camera: Camera,
     max_pair_distance: Float[Array, ""],
 ) -> tuple[jaxlie.SE3, jaxlie.SE3]:
-    """The current pose through the points of the previous image (R7): `via_previous` and `same_image`.
+    """Compute the current pose through the points of the previous image (R7): `via_previous` and `same_image`.
 
     Args:
-        previous: the previous frame as it was aligned with the map, world frame.
+        previous: the previous frame, aligned with the map, world frame.
         T_previous_current: the prior's motion, scaled.
         camera: of the rows.
-        max_pair_distance: fraction of the depth; farther points are no pair.
+        max_pair_distance: fraction of the depth; points farther apart are no pair.
     """
     now = prediction.previous
     carried, via = _pairs_via_previous(prediction, previous, scale, T_previous_current, camera, max_pair_distance)
@@ -111,9 +111,9 @@ def _pairs_via_previous(
     camera: Camera,
     max_pair_distance: Float[Array, ""],
 ) -> tuple[Float[Array, "p 3"], Bool[Array, "p"]]:
-    """The printed chain: current point -> closest point of the previous image now -> the same pixel before.
+    """Pair points by the printed chain: current point -> closest point of the previous image now -> same pixel before.
 
-    The closest point is looked up by projection, which needs no tree, from `T_previous_current` of the prior.
+    The closest point is found by projection with the prior's `T_previous_current`, without a tree.
 
     Returns:
         A world-frame point for every current one, and which of these pairs exist.

@@ -1,4 +1,4 @@
-"""Rigid motions: what jaxlie does not bring, and fits of paired points."""
+"""Rigid motions: what jaxlie lacks, and fits of paired points."""
 
 import jax
 import jax.numpy as jnp
@@ -9,21 +9,21 @@ from emgs_jax.ops.linalg import ROUNDED, SMALLEST_LENGTH
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.ranks import kth_smallest
 
-MIN_PAIRS = 16  # fewer pairs of noisy points do not make a pose
+MIN_PAIRS = 16  # fewer pairs of noisy points give no pose
 
 
 def pose_row(poses: jaxlie.SE3, row: int | Int[Array, ""]) -> jaxlie.SE3:
-    """One pose of a batch."""
+    """Take one pose of a batch."""
     return jaxlie.SE3(poses.wxyz_xyz[row])
 
 
 def scale_translation(T: jaxlie.SE3, scale: Float[Array, ""]) -> jaxlie.SE3:
-    """The pose with its translation multiplied."""
+    """Multiply the translation of a pose."""
     return jaxlie.SE3.from_rotation_and_translation(T.rotation(), scale * T.translation())
 
 
 def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, ""]:
-    """Lower median of the valid values; 1 without any."""
+    """Compute the lower median of the valid values; 1 without any."""
     count = jnp.sum(valid)
     middle = kth_smallest(values, valid, jnp.maximum(count - 1, 0)[None] // 2)[0]
     return jnp.where(count > 0, middle, 1.0)
@@ -33,10 +33,10 @@ def median(values: Float[Array, "p"], valid: Bool[Array, "p"]) -> Float[Array, "
 def fit_rigid(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], weights: Float[Array, "p"]
 ) -> tuple[jaxlie.SE3, Float[Array, ""]]:
-    """Weighted least-squares T_target_source of paired points, and the scale of the similarity that would fit best.
+    """Fit T_target_source to paired points by weighted least squares; also return the scale of the best similarity.
 
     Source: Umeyama, "Least-squares estimation of transformation parameters between two point patterns", 1991.
-    Without weights the identity and 1.
+    If all weights are 0: the identity and 1.
     """
     total = jnp.sum(weights)
     share = weights / jnp.where(total > 0, total, 1.0)
@@ -45,7 +45,7 @@ def fit_rigid(
     moments = (share[:, None] * b).T @ a
     u, s, vt = jnp.linalg.svd(jax.lax.stop_gradient(moments))
     handed = jnp.array([1.0, 1.0, 1.0]).at[2].set(jnp.sign(jnp.linalg.det(u @ vt)))
-    # Slopes of the rotation itself: those of its two factors are infinite where singular values are equal.
+    # Gradients of the rotation itself: those of its two factors are infinite if singular values are equal.
     signed, inner = s * handed, handed[:, None] * (u.T @ moments @ vt.T)
     both = signed[:, None] + signed
     is_known = both > ROUNDED * s[0]
@@ -60,7 +60,7 @@ def fit_rigid(
 
 
 def _slope_only(values: Float[Array, "*b"]) -> Float[Array, "*b"]:
-    """0, with the derivatives of `values`."""
+    """Return 0 with the derivatives of `values`."""
     return values - jax.lax.stop_gradient(values)
 
 
@@ -68,7 +68,7 @@ def _slope_only(values: Float[Array, "*b"]) -> Float[Array, "*b"]:
 def fit_rigid_robust(
     source: Float[Array, "p 3"], target: Float[Array, "p 3"], paired: Bool[Array, "p"], start: jaxlie.SE3
 ) -> jaxlie.SE3:
-    """Rigid fit of pairs, robust by three reweightings around the median distance; `start` with too few pairs."""
+    """Fit pairs rigidly, robust by three reweightings around the median distance; `start` with too few pairs."""
     size = median(jnp.sqrt(jnp.sum(source**2, axis=-1)), paired)
 
     def reweight(T: jaxlie.SE3, _: None) -> tuple[jaxlie.SE3, None]:

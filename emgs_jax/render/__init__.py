@@ -1,1 +1,1 @@
-"""Gaussian splatting in pure JAX: project (EWA), tiles (who is where), composite (front to back), one verb `render`."""
+"""Gaussian splatting in pure JAX: project (EWA), list splats by tile, composite front to back; `render` does all."""

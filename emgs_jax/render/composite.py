@@ -16,9 +16,9 @@ from emgs_jax.ops.pytree import static, take_rows, traced
 from emgs_jax.render.project import Splats, project_gaussians
 from emgs_jax.render.tiles import CHUNK, Chunks, TileLists, list_splats, num_tiles, take_chunks, tile_corners
 
-OPAQUE = 0.99  # coverage of a pixel behind which nothing changes it by more than a hundredth
-MAX_ALPHA = 0.999  # of its light that a splat takes from those behind it, so that a logarithm of the rest exists
-ROUNDED = 2.0**-20  # of a depth, its least standard deviation: that of its rounding
+OPAQUE = 0.99  # coverage of a pixel beyond which farther splats change it by less than a hundredth
+MAX_ALPHA = 0.999  # of the light that a splat may take from those behind it, so that a logarithm of the rest exists
+ROUNDED = 2.0**-20  # of a depth: smallest standard deviation, by rounding
 Sums: TypeAlias = tuple[Float[Array, "t v q"], Float[Array, "t q"], Float[Array, "t q"], Float[Array, "t q"]]
 State = TypeVar("State")
 
@@ -28,10 +28,10 @@ class RenderConfig(eqx.Module):
 
     Args:
         tile_size: pixels along a tile's side.
-        tile_capacity: splats of a tile, on average over the tiles: one may hold more. A dozen bytes for each. The
-            nearest of the image come first; `Rendering.overflow` counts those that are missed.
-        tile_batch: times CHUNK splats of tiles are drawn at once, which bounds the memory: some six times as many
-            floats as they have pixels.
+        tile_capacity: splats per tile, on average over the tiles; a single tile may hold more. About 12 bytes each. The
+            nearest splats of the image come first; `Rendering.overflow` counts those that do not fit.
+        tile_batch: chunks (of CHUNK splats) drawn at once. This bounds the memory to about six floats per splat and
+            pixel of its tile.
         opacity: of every Gaussian at its centre (the paper's constant opacity).
         covariance_scale: factor on the covariances, so that neighbouring Gaussians close the surface.
         blur: pixels²; low-pass filter.
@@ -53,12 +53,12 @@ class Rendering(eqx.Module):
     """Images of the map.
 
     Args:
-        values: composited values (not divided by alpha; 0 where nothing is).
+        values: composited values, not divided by alpha; 0 where nothing is drawn.
         alpha: coverage in [0, 1].
         depth: expected camera-space z in metres; 0 where alpha is below `min_alpha`.
-        depth_std: standard deviation in metres of the depth over the splats of a pixel: large where two surfaces mix.
-        overflow: splats for which there was no room, summed over the tiles in which something is seen behind those
-            that are drawn; where every pixel is opaque they are hidden.
+        depth_std: standard deviation in metres of the depth over the splats of a pixel; large where two surfaces mix.
+        overflow: splats that did not fit, summed over the tiles that are not fully opaque; in the others they would be
+            hidden anyway.
     """
 
     values: Float[Array, "h w c"]
@@ -69,7 +69,7 @@ class Rendering(eqx.Module):
 
 
 def splat_alpha(splats: Splats, pixels: Float[Array, "*p q 2"], config: RenderConfig) -> Float[Array, "*c q"]:
-    """Opacity of every splat at every pixel: opacity · exp(-½ d²) up to `MAX_ALPHA`; 0 beyond `radius` deviations."""
+    """Compute each splat's opacity at every pixel: opacity · exp(-½ d²) up to `MAX_ALPHA`; 0 beyond `radius`."""
     dx, dy = _offsets(splats, pixels)
     a, b, c = (splats.precisions[..., i, j, None] for i, j in ((0, 0), (0, 1), (1, 1)))
     distance_sq = a * dx**2 + 2.0 * b * dx * dy + c * dy**2
@@ -79,7 +79,7 @@ def splat_alpha(splats: Splats, pixels: Float[Array, "*p q 2"], config: RenderCo
 
 
 def splat_depth(splats: Splats, pixels: Float[Array, "*p q 2"], config: RenderConfig) -> Float[Array, "*c q"]:
-    """Camera-space z of every splat's plane at every pixel, kept within the splat's own extent in depth."""
+    """Compute camera-space z of every splat's plane at every pixel, limited to the splat's extent in depth."""
     dx, dy = _offsets(splats, pixels)
     slope = splats.depth_slope[..., None]
     inverse = splats.inverse_depth[..., None] + slope[..., 0, :] * dx + slope[..., 1, :] * dy
@@ -90,14 +90,14 @@ def splat_depth(splats: Splats, pixels: Float[Array, "*p q 2"], config: RenderCo
 
 
 def _offsets(splats: Splats, pixels: Float[Array, "*p q 2"]) -> tuple[Float[Array, "*c q"], Float[Array, "*c q"]]:
-    """x and y of every pixel from every splat's mean."""
+    """Compute the x and y offsets of every pixel from every splat's mean."""
     return pixels[..., 0] - splats.means[..., 0, None], pixels[..., 1] - splats.means[..., 1, None]
 
 
 def at_pixels(
     splats: Splats, chunks: Chunks, pixels: Float[Array, "t q 2"], config: RenderConfig
 ) -> tuple[Float[Array, "c k q"], Float[Array, "c k q"]]:
-    """Opacity of the chunks' splats at the pixels of their tiles, and depth, 0 where that is 0."""
+    """Compute opacity of the chunks' splats at their tiles' pixels, and depth; 0 where the opacity is 0."""
     near = take_rows(splats, chunks.rows)
     seen = take_rows(pixels, chunks.tiles)[:, None]
     alpha = jnp.where(chunks.exists[..., None], splat_alpha(near, seen, config), 0.0)
@@ -107,15 +107,15 @@ def at_pixels(
 def _sum_before(
     terms: Float[Array, "c k q"], chunks: Chunks, total: Float[Array, "t q"]
 ) -> tuple[Float[Array, "c k q"], Float[Array, "t q"]]:
-    """Sum of the terms that come before each one in its tile's list, and of all so far.
+    """Sum the terms that come before each one in its tile's list, and all terms so far.
 
     Args:
         terms: of the splats of some chunks.
-        chunks: of whose tiles.
-        total: sum of the chunks before these; likewise with these.
+        chunks: these chunks.
+        total: sum over the earlier chunks; the second result includes these.
     """
     count, length, _ = terms.shape
-    # Products with triangles of ones: `cumsum` is several passes on every device, and twenty times slower on a CPU.
+    # Products with triangles of ones: `cumsum` takes several passes on every device, and 20 times as long on a CPU.
     triangle = jnp.broadcast_to(jnp.tri(length, k=-1), (count, length, length))
     within = jnp.einsum("ckl,clq->ckq", triangle, terms)
     whole = within[:, -1] + terms[:, -1]
@@ -128,14 +128,14 @@ def _sum_before(
 def light_before(
     alpha: Float[Array, "c k q"], chunks: Chunks, log_light: Float[Array, "t q"]
 ) -> tuple[Float[Array, "c k q"], Float[Array, "t q"]]:
-    """Light that reaches every splat of some chunks, and the logarithm of what is left behind them."""
+    """Compute the light that reaches every splat of some chunks, and the log of what remains behind them."""
     before, log_light = _sum_before(jnp.log(1.0 - alpha), chunks, log_light)
     return jnp.exp(before), log_light
 
 
 def _add(sums: Sums, chunks: Chunks, weights: Float[Array, "c k q"], depth: Array, values: Array) -> Sums:
-    """The sums over the splats so far, with those of some chunks."""
-    # Sums as products with ones: a reduction is one thread's work on a CPU.
+    """Add the splats of some chunks to the sums."""
+    # Sum by products with ones: a reduction uses one thread on a CPU.
     ones = jnp.ones((*weights.shape[:2], 1))
     moments = (jnp.einsum("cko,ckq->cq", ones, weights * depth**power) for power in range(3))
     more = jnp.einsum("ckv,ckq->cvq", values[chunks.rows], weights), *moments
@@ -143,7 +143,7 @@ def _add(sums: Sums, chunks: Chunks, weights: Float[Array, "c k q"], depth: Arra
 
 
 def over_chunks(visit: Callable[[Chunks, State], State], start: State, lists: TileLists, config: RenderConfig) -> State:
-    """Visit all chunks of the lists, `tile_batch` at once, as many times as it takes."""
+    """Visit all chunks of the lists, `tile_batch` at a time."""
     count = min(config.tile_batch, lists.rows.shape[0] // CHUNK + lists.overflow.shape[0])
 
     def step(turn: Int[Array, ""], state: State) -> State:
@@ -161,8 +161,8 @@ def composite(
 ) -> Sums:
     """Blend the splats of every tile, nearest first: Σ w v, Σ w, Σ w z and Σ w z² of every pixel.
 
-    The weight of a splat is its opacity times the light that those before it let through; or, with a `front`, the
-    opacity alone of those whose depth lies between its two (m).
+    The weight of a splat is its opacity times the light that nearer splats let through. With a `front` it is the
+    opacity alone, of splats whose depth lies between the two values (m).
     """
     splats, values, config = drawn
 
@@ -180,7 +180,7 @@ def composite(
 def _share(
     alpha: Float[Array, "c k q"], depth: Float[Array, "c k q"], chunks: Chunks, log_light: Array, front: Any
 ) -> tuple[Float[Array, "c k q"], Float[Array, "t q"]]:
-    """By what the opacity is multiplied to be a splat's weight, and the logarithm of the light behind these chunks."""
+    """Compute the factor from opacity to weight of every splat, and the log of the light behind these chunks."""
     if front is None:
         return light_before(alpha, chunks, log_light)
     low, high = (take_rows(x, chunks.tiles)[:, None] for x in front)
@@ -198,10 +198,10 @@ def _composite_forward(_, drawn: Any, lists: TileLists, pixels: Array, front: An
 def _composite_backward(
     sums: Sums, slopes: Any, _, drawn: Any, lists: TileLists, pixels: Array, front: Any
 ) -> PyTree[Array]:
-    """Visit the chunks once more, so that nothing need be kept of them, as 3DGS does.
+    """Visit the chunks a second time, so that nothing need be stored, as 3DGS does.
 
-    With the slope g of the result by a splat's weight w = α T, that by its opacity is T g less what it takes from those
-    behind it, Σ w g / (1 - α).
+    Let g be the derivative of the result by a splat's weight w = α T. Its derivative by the opacity is T g minus what
+    the splat takes from those behind it, Σ w g / (1 - α).
     """
     splats, values, config = drawn
     slopes = jax.tree.map(lambda x, y: jnp.zeros_like(x) if y is None else y, sums, slopes)
@@ -245,27 +245,27 @@ def render(
 
 
 def splats_of(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, config: RenderConfig) -> Splats:
-    """The Gaussians on the image plane, as they are drawn."""
+    """Project the Gaussians to the image plane as `render` draws them."""
     return project_gaussians(gaussians, T_world_camera, camera, config.covariance_scale, config.blur)
 
 
 def render_splats(splats: Splats, values: Float[Array, "n v"], camera: Camera, config: RenderConfig) -> Rendering:
-    """`render` for Gaussians that are projected already."""
+    """Render projected Gaussians."""
     lists, pixels = lists_of(splats, camera, config)
     return rendering_of(composite((splats, values, config), lists, pixels, None), lists, camera, config)
 
 
 def lists_of(splats: Splats, camera: Camera, config: RenderConfig) -> tuple[TileLists, Float[Array, "t q 2"]]:
-    """The splats of every tile, and its pixels, row-major."""
+    """List the splats of every tile, and its pixels, row-major."""
     step = jnp.arange(config.tile_size, dtype=jnp.float32)
     inside = jnp.stack(jnp.meshgrid(step, step, indexing="xy"), axis=-1).reshape(-1, 2)
     pixels = tile_corners(camera, config.tile_size)[:, None] + inside
-    splats, radius = jax.lax.stop_gradient((splats, config.radius))  # who is where has no slope
+    splats, radius = jax.lax.stop_gradient((splats, config.radius))  # the lists have no gradient
     return list_splats(splats, camera, config.tile_size, config.tile_capacity, radius), pixels
 
 
 def rendering_of(sums: Sums, lists: TileLists, camera: Camera, config: RenderConfig) -> Rendering:
-    """The means behind what `composite` gives for the tiles."""
+    """Turn the sums of `composite` into images of the tiles: values, coverage, depth and its deviation."""
     values, alpha, depth_sum, depth_sq_sum = images_of(sums, camera, config)
     is_covered = alpha >= jnp.maximum(config.min_alpha, 1e-6)
     total = jnp.where(is_covered, alpha, 1.0)
@@ -277,7 +277,7 @@ def rendering_of(sums: Sums, lists: TileLists, camera: Camera, config: RenderCon
 
 
 def _seen_overflow(overflow: Int[Array, "t"], alpha: Float[Array, "h w"], tile_size: int) -> Int[Array, ""]:
-    """The overflow of the tiles that have a pixel which is not opaque."""
+    """Sum the overflow of tiles that have a pixel which is not opaque."""
     height, width = alpha.shape
     rows, columns = -(-height // tile_size), -(-width // tile_size)
     beyond = (0, rows * tile_size - height), (0, columns * tile_size - width)
@@ -286,14 +286,14 @@ def _seen_overflow(overflow: Int[Array, "t"], alpha: Float[Array, "h w"], tile_s
 
 
 def images_of(sums: Sums, camera: Camera, config: RenderConfig) -> tuple[Float[Array, "h w *v"], ...]:
-    """Values (h, w, v) and the three others (h, w), of all tiles."""
+    """Assemble values (h, w, v), coverage, depth and its deviation (h, w) from all tiles."""
     values, *others = sums
     tiles = values.swapaxes(1, 2), *others
     return tuple(_assemble(x, camera, config.tile_size) for x in tiles)
 
 
 def _assemble(tiles: Float[Array, "t q *c"], camera: Camera, tile_size: int) -> Float[Array, "h w *c"]:
-    """Tiles in row-major order -> image, cut at the border."""
+    """Assemble tiles in row-major order into an image, cropped at the border."""
     columns, rows = num_tiles(camera, tile_size)
     channels = tiles.shape[2:]
     grid = tiles.reshape(rows, columns, tile_size, tile_size, *channels).swapaxes(1, 2)

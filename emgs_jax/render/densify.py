@@ -1,4 +1,4 @@
-"""Densification: a point with normal and colour for every pixel of a view, the paper's rule for a sparse map."""
+"""Densification: a point with normal and colour for every pixel of a view, as the paper does for its sparse map."""
 
 import equinox as eqx
 import jax
@@ -29,13 +29,13 @@ from emgs_jax.render.tiles import Chunks, TileLists
 
 
 class DensifyConfig(eqx.Module):
-    """Choice of the rendered pixels that become points of the densified cloud.
+    """Which rendered pixels become points of the densified cloud.
 
     Args:
-        surface_depth: fraction of the depth; splats within it of the front belong to one surface.
+        surface_depth: fraction of the depth; splats this near to the front belong to one surface.
         min_alpha: a pixel with less coverage has no depth.
-        min_std: m; the floor of the covariances, which is not drawn along the surface, see `without_floor`.
-        points: those of the `map` (the paper's rule), or the frames' `own` that the map does not contradict, see
+        min_std: m; floor of the covariances, which is not drawn along the surface, see `without_floor`.
+        points: of the `map` (the paper's rule), or the frames' `own` points that the map does not contradict, see
             `emgs_jax.runs.dense.uncontradicted`.
     """
 
@@ -47,10 +47,9 @@ class DensifyConfig(eqx.Module):
 
 
 class DenseView(eqx.Module):
-    """Points of one view. World frame; rows of pixels that are not valid hold finite values of no meaning.
+    """Points of one view, world frame; rows of invalid pixels hold arbitrary finite values.
 
-    Where a pixel is `covered` its point is about where the map begins, also where that is too little for a depth to
-    count: enough to ask what is there.
+    The point of a `covered` pixel lies about where the map begins, even if the coverage is too low for a depth.
     """
 
     points: Float[Array, "h w 3"]
@@ -66,9 +65,9 @@ class DenseView(eqx.Module):
 def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, config: DensifyConfig) -> DenseView:
     """Render depth, normals and colours of the map from one pose and back-project every pixel that has a depth.
 
-    The front of a pixel is the weighted median of its splats' depths as they are rendered, that is nearly opaque. What
-    lies within `surface_depth` of it is one surface, whose layers are averaged by how near the pixel is to each splat's
-    centre, whichever comes first: the nearest layer alone would be too near, and what is behind shines through nothing.
+    The front of a pixel is the weighted median of its splats' depths. Splats within `surface_depth` of it are one
+    surface. Its layers are averaged by how near the pixel is to each splat's centre, regardless of their order: the
+    nearest layer alone would be too near, and what lies behind must not shine through.
     """
     values = jnp.concatenate([gaussians.colors, gaussians.normals], axis=-1)
     drawn = eqx.tree_at(lambda r: r.min_alpha, config.render, config.min_alpha)
@@ -96,11 +95,11 @@ def densify(gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, co
 
 
 def without_floor(gaussians: Gaussians, min_std: Float[Array, ""]) -> Gaussians:
-    """The Gaussians as wide along their surfaces as their points lie: Σ - min(σ², λ) (I - nn').
+    """Remove the floor of the covariances along the surface: Σ - min(σ², λ) (I - nn').
 
-    A fit adds the floor σ² = `min_std`² in all directions, so that each covariance can be inverted. Drawn, it makes the
-    borders of near things a pixel or two too wide. λ is the smaller variance along the surface: what has no floor, or
-    another one, is not turned inside out.
+    A fit adds the floor σ² = `min_std`² in all directions, so that each covariance can be inverted. If drawn, it makes
+    the borders of near things a pixel or two too wide. λ is the smaller variance along the surface, so that a Gaussian
+    without this floor stays positive.
     """
     basis = tangent_basis(gaussians.normals)
     along = jnp.einsum("nda,ndc,ncb->nab", basis, gaussians.covs, basis)
@@ -114,7 +113,7 @@ def without_floor(gaussians: Gaussians, min_std: Float[Array, ""]) -> Gaussians:
 def median_depth(
     splats: Splats, lists: TileLists, pixels: Float[Array, "t q 2"], alpha: Float[Array, "t q"], config: RenderConfig
 ) -> Float[Array, "t q"]:
-    """Depth of the first splat of every pixel behind which no more than half of its coverage `alpha` lies (m)."""
+    """Find every pixel's median depth (m): the first splat behind which at most half of its coverage `alpha` lies."""
     never = lists.rows.shape[0]
 
     def visit(chunks: Chunks, state: tuple[Int[Array, "t q"], Array]) -> tuple[Int[Array, "t q"], Array]:

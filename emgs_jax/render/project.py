@@ -1,4 +1,4 @@
-"""EWA projection: a Gaussian in space becomes one on the image plane, with an inverse depth that varies over it."""
+"""EWA projection: from a Gaussian in space to one on the image plane, whose inverse depth varies linearly."""
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -10,20 +10,20 @@ from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, project
 from emgs_jax.ops.linalg import inverse_2x2
 from emgs_jax.ops.precision import full_precision
 
-# A splat that is seen at a grazing angle has no depth slope that its linearisation could hold.
+# At a grazing angle, no linear depth slope describes a splat.
 SMALLEST_COSINE = 0.1
-# Standard deviations of its depth by which a Gaussian must lie before the camera: of one that reaches the camera's
-# plane, as that of a door frame does in passing, the affine approximation makes a splat that hides everything.
+# Standard deviations of its depth by which a Gaussian must lie in front of the camera. If one reaches the camera's
+# plane, as a door frame does in passing, the affine approximation turns it into a splat that hides everything.
 NEAREST_STD = 2.0
-# Pixels; points far outside the image project with unbounded Jacobians, so the Jacobian is taken at most this far out.
+# Points far outside the image have unbounded Jacobians, so the Jacobian is taken at most this far out,
 FRUSTUM_MARGIN = 0.3  # of the image's size
 
 
 class Splats(eqx.Module):
     """Gaussians on the image plane, row by row those of the map.
 
-    The inverse depth at pixel p is `inverse_depth + depth_slope · (p - mean)`, which is exact for the plane through
-    the Gaussian's mean with its normal.
+    The inverse depth at pixel p is `inverse_depth + depth_slope · (p - mean)`, exact for the plane through the
+    Gaussian's mean with its normal.
     """
 
     means: Float[Array, "n 2"]  # pixels
@@ -41,10 +41,10 @@ class Splats(eqx.Module):
 def project_gaussians(
     gaussians: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, scale: Float[Array, ""], blur: Float[Array, ""]
 ) -> Splats:
-    """Project with the local affine approximation (Zwicker et al., "EWA splatting", 2002).
+    """Project Gaussians with the local affine approximation (Zwicker et al., "EWA splatting", 2002).
 
-    A surface is seen from the side that it was mapped from: of a Gaussian whose normal points away from the camera
-    nothing is drawn, or the other side of a thin wall would show through it where both are a little off.
+    A Gaussian whose normal points away from the camera is not drawn: a surface is seen only from the side it was mapped
+    from. Otherwise the other side of a thin wall would show through where both are slightly off.
 
     Args:
         scale: by which the covariances are multiplied, so that neighbouring Gaussians close the surface.
@@ -74,7 +74,7 @@ def project_gaussians(
 
     depth_var = covs[:, 2, 2]
     depth_std = jnp.sqrt(jnp.where(depth_var > 0, depth_var, 1.0))
-    # The plane n·X = n·μ meets the ray d = (x, y, 1) at 1/z = n·d / n·μ, which is linear in the pixel.
+    # The plane n·X = n·μ meets the ray d = (x, y, 1) at 1/z = n·d / n·μ, linear in the pixel.
     facing = jnp.einsum("ni,ni->n", normals, points)
     limit = SMALLEST_COSINE * jnp.linalg.norm(jnp.where(is_in_front[:, None], points, 1.0), axis=-1)
     is_flat = jnp.abs(facing) > limit

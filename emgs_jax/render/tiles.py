@@ -8,18 +8,18 @@ from jaxtyping import Array, Bool, Float, Int
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.project import Splats
 
-CHUNK = 32  # splats of a tile that are composited at once; the last of a tile may have fewer
-WORD = 2**31  # what an integer holds
+CHUNK = 32  # splats of a tile that are composited at once; a tile's last chunk may have fewer
+WORD = 2**31  # range of an integer
 
 
 class TileLists(eqx.Module):
     """The splats of every tile, nearest first, one tile after the other.
 
     Args:
-        rows: of the splats; what is past the last tile's has no meaning.
-        bounds: where the tiles' lists begin, and where the last one ends.
+        rows: of the splats; arbitrary past the last tile's list.
+        bounds: start of every tile's list, and end of the last one.
         chunks: likewise in chunks of CHUNK splats.
-        overflow: how many splats of every tile had no room.
+        overflow: how many splats of every tile did not fit.
     """
 
     rows: Int[Array, "e"]
@@ -32,9 +32,9 @@ class Chunks(eqx.Module):
     """Some consecutive chunks of the lists.
 
     Args:
-        tiles: to which they belong; past the last tile where there is none.
+        tiles: to which they belong; past the last tile for empty slots.
         positions: in the lists.
-        rows: of the splats; those of the first in the lists where there is none.
+        rows: of the splats; the first of the lists for empty slots.
     """
 
     tiles: Int[Array, "c"]
@@ -44,12 +44,12 @@ class Chunks(eqx.Module):
 
 
 def num_tiles(camera: Camera, tile_size: int) -> tuple[int, int]:
-    """Columns and rows of tiles; the last ones may reach over the border."""
+    """Count columns and rows of tiles; the last ones may extend beyond the border."""
     return -(-camera.width // tile_size), -(-camera.height // tile_size)
 
 
 def tile_corners(camera: Camera, tile_size: int) -> Float[Array, "t 2"]:
-    """Pixel (x, y) of the upper left corner of every tile, row-major."""
+    """Compute the pixel (x, y) of every tile's upper left corner, row-major."""
     x, y = (tile_size * jnp.arange(count, dtype=jnp.float32) for count in num_tiles(camera, tile_size))
     return jnp.stack(jnp.meshgrid(x, y, indexing="xy"), axis=-1).reshape(-1, 2)
 
@@ -62,12 +62,12 @@ def list_splats(splats: Splats, camera: Camera, tile_size: int, capacity: int, r
 
     Args:
         tile_size: pixels along a tile's side.
-        capacity: splats of a tile for which there is room, on average over the tiles; the nearest of all come first.
+        capacity: splats per tile, on average over the tiles; the nearest of all come first.
         radius: standard deviations.
     """
     columns, lines = num_tiles(camera, tile_size)
     num_splats, num_lists = splats.depth.shape[0], columns * lines
-    # Positive floats are ordered as their bits are.
+    # Positive floats sort like their bits.
     depth = jax.lax.bitcast_convert_type(jnp.where(splats.valid, splats.depth, jnp.inf), jnp.int32)
     order = jnp.argsort(depth, stable=True)
     first, size = (x[order] for x in _touched(splats, jnp.array([columns, lines]), tile_size, radius))
@@ -90,7 +90,7 @@ def list_splats(splats: Splats, camera: Camera, tile_size: int, capacity: int, r
 def _touched(
     splats: Splats, num: Int[Array, "2"], tile_size: int, radius: Float[Array, ""]
 ) -> tuple[Int[Array, "n 2"], Int[Array, "n 2"]]:
-    """Column and row of the first tile that every splat's box meets, and how many tiles wide and high that is."""
+    """Find the first tile (column, row) that every splat's box meets, and the box's width and height in tiles."""
     half = radius * jnp.sqrt(jnp.stack([splats.covs[:, 0, 0], splats.covs[:, 1, 1]], axis=-1))
     low, high = splats.means - half, splats.means + half
     first = jnp.clip(jnp.ceil((low - (tile_size - 1)) / tile_size), 0, num).astype(jnp.int32)
@@ -102,7 +102,7 @@ def _touched(
 def _sorted(
     tile: Int[Array, "e"], splat: Int[Array, "e"], num_lists: int, num_splats: int
 ) -> tuple[Int[Array, "e"], Int[Array, "e"]]:
-    """Pairs by tile and then by splat. One word for both, where it holds them, is sorted several times faster."""
+    """Sort pairs by tile, then by splat. If one word holds both, sorting it is several times faster."""
     if (num_lists + 1) * num_splats < WORD:
         return jnp.divmod(jax.lax.sort(tile * num_splats + splat, is_stable=False), num_splats)
     tile, splat = jax.lax.sort((tile, splat), num_keys=2, is_stable=False)
@@ -110,7 +110,7 @@ def _sorted(
 
 
 def _num_touching(first: Int[Array, "n 2"], size: Int[Array, "n 2"], shape: tuple[int, int]) -> Int[Array, "t"]:
-    """Splats that touch every tile: what begins minus what has ended, summed along both axes."""
+    """Count the splats that touch every tile: boxes that begin minus boxes that ended, summed along both axes."""
     (x0, y0), (x1, y1) = first.T, (first + size).T
     changes = jnp.zeros((shape[0] + 1, shape[1] + 1), jnp.int32)
     changes = changes.at[y0, x0].add(1).at[y1, x1].add(1).at[y0, x1].add(-1).at[y1, x0].add(-1)
@@ -118,13 +118,13 @@ def _num_touching(first: Int[Array, "n 2"], size: Int[Array, "n 2"], shape: tupl
 
 
 def take_chunks(lists: TileLists, begin: Int[Array, ""], count: int) -> Chunks:
-    """`count` chunks of the lists, from chunk `begin` on."""
+    """Take `count` chunks of the lists, from chunk `begin` on."""
     last = lists.bounds.shape[0] - 2
     numbers = begin + jnp.arange(count)
     tiles = jnp.searchsorted(lists.chunks[1:], numbers, side="right")
     of = jnp.minimum(tiles, last)
     starts = lists.bounds[of] + (numbers - lists.chunks[of]) * CHUNK
     positions = starts[:, None] + jnp.arange(CHUNK)
-    exists = positions < lists.bounds[of + 1][:, None]  # past the last tile none is
-    # The first exists wherever anything does: what stands for nothing is finite.
+    exists = positions < lists.bounds[of + 1][:, None]  # none past the last tile
+    # The first row exists if any does, so empty slots hold finite values.
     return Chunks(tiles, positions, lists.rows[jnp.where(exists, positions, 0)], exists)

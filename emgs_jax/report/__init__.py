@@ -1,1 +1,1 @@
-"""Pages and tables of runs: report.html, results of many runs, numbers that papers print beside them, the gate."""
+"""Pages and tables of runs: report.html, results of many runs beside published numbers, and the gate."""

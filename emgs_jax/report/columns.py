@@ -14,7 +14,7 @@ DASH = "–"
 
 
 class Column(NamedTuple):
-    """A metric as people read it."""
+    """A metric as a column of a table."""
 
     key: str
     title: str
@@ -31,8 +31,8 @@ MAIN = (
     Column("reconstruction/f1_5cm_percent", "F1@.05 [%]", 1.0, 1, False),
     Column("reconstruction/normals_abs_cos_percent", "normals [%]", 1.0, 1, False),
 )
-BY_PATH = tuple(column._replace(title=f"path: {column.title}") for column in MAIN[1:])  # beside those by points
-PLACED = tuple(  # by their points
+BY_PATH = tuple(column._replace(title=f"path: {column.title}") for column in MAIN[1:])  # aligned by trajectory
+PLACED = tuple(  # aligned by ICP
     column._replace(key=column.key.replace("/", "_icp/"), title=f"ICP: {column.title}") for column in MAIN[1:]
 )
 RENDERED = (  # at their own poses
@@ -45,14 +45,14 @@ RENDERED = (  # at their own poses
 
 
 class Cell(NamedTuple):
-    """A number in a table, or any text with a kind: `best`, or a CSS class; a plain text is a str."""
+    """A number or text in a table with a kind: `best`, or a CSS class; plain text is a str."""
 
     text: str
     kind: str = ""
 
 
 class Table(NamedTuple):
-    """Titles, and lines of as many cells."""
+    """Titles, and lines with as many cells."""
 
     titles: Sequence[str]
     lines: Sequence[Sequence[str | Cell]]
@@ -62,9 +62,9 @@ class Line(NamedTuple):
     """Metrics of one estimate."""
 
     labels: Sequence[str]  # its first cells
-    values: Mapping[str, float | None]  # by key; None where there is none
+    values: Mapping[str, float | None]  # by key; None without a value
     spreads: Mapping[str, float | None] = {}
-    rivals: Hashable = ()  # the same of all lines that it competes with; None: with none
+    rivals: Hashable = ()  # equal for all lines that compete; None: competes with none
 
 
 def known(columns: Iterable[Column], rows: Sequence[Mapping[str, Any]]) -> list[Column]:
@@ -73,7 +73,7 @@ def known(columns: Iterable[Column], rows: Sequence[Mapping[str, Any]]) -> list[
 
 
 def in_unit(columns: Iterable[Column], data: Collection[str]) -> list[Column]:
-    """Titles of lengths as they are for data sets of these names: in centimetres, or in the truth's own unit."""
+    """Give columns of lengths their unit for these data sets: centimetres, or the truth's own unit."""
     own = [name in OWN_UNITS for name in data]
     unit = "cm" if not any(own) else ".01 units" if all(own) else "cm or .01 units"
     return [column._replace(title=column.title.replace("[cm]", f"[{unit}]")) for column in columns]
@@ -84,7 +84,7 @@ def metric_table(
 ) -> Table:
     """Lay out metrics below the titles of the labels and of the columns; the best of several rivals is marked.
 
-    `data` are the names of the data sets that they are of, which say the unit of lengths.
+    `data` names the data sets of the lines, which determine the unit of lengths.
     """
     numbers: dict[tuple, list[float]] = {}
     for line in lines:
@@ -112,7 +112,7 @@ def transposed(table: Table) -> Table:
 
 
 def cell(mean: float | None, spread: float | None, factor: float, digits: int, sign: str = "") -> str:
-    """Write mean ± spread; a dash where there is no mean, NaN included. `sign="+"` writes it of positive ones too."""
+    """Write mean ± spread; a dash for a missing mean or NaN. `sign="+"` also marks positive numbers."""
     if mean is None or mean != mean:
         return DASH
     return f"{factor * mean:{sign}.{digits}f}" + ("" if spread is None else f" ± {factor * spread:.{digits}f}")
@@ -135,7 +135,7 @@ def markdown(table: Table) -> str:
 
 
 def aligned(table: Table) -> str:
-    """Write a table for a terminal: labels to the left, all else to the right, a line below the titles."""
+    """Write a table for a terminal: labels aligned left, the rest right, a line below the titles."""
     texts = [[cell_text(content) for content in line] for line in (table.titles, *table.lines)]
     widths = [max(map(len, column)) for column in zip(*texts, strict=True)]
     rows = ["  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])]).rstrip() for line in texts]
@@ -143,7 +143,7 @@ def aligned(table: Table) -> str:
 
 
 def csv_text(rows: Sequence[Mapping[str, Any]]) -> str:
-    """Write CSV with a line for each row; what a row does not have is empty."""
+    """Write CSV with a line for each row; missing values are empty."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(dict.fromkeys(name for row in rows for name in row)), lineterminator="\n")
     writer.writeheader()

@@ -1,4 +1,4 @@
-"""report.html of an evaluation: what became of every run, ours beside the prior alone and the baselines, the gate."""
+"""report.html of an evaluation: outcome of every run, ours beside raw prior and baselines, and the gate."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from emgs_jax.runs.results import METRICS_FILE, Estimate, read_metrics
 
 
 class JobLine(NamedTuple):
-    """A run of an evaluation: its name, its folder, and why it has no result ("" where it has one)."""
+    """A run of an evaluation: its name, its folder, and why it has no result ("" if it has one)."""
 
     name: str
     folder: Path
@@ -28,12 +28,12 @@ class Found(NamedTuple):
     jobs: Sequence[JobLine]
     rows: Sequence[Row]
     estimates: Sequence[Estimate]
-    gate: str | None = None  # the file that was compared with
+    gate: str | None = None  # the file of the baseline
     regressions: Sequence[str] = ()  # metrics that are worse than the gate allows, a line each
 
 
 def write_evaluation_page(out: Path, found: Found, command: str) -> Path:
-    """Write report.html into the folder of an evaluation; `command` repeats it, "" where nobody knows."""
+    """Write report.html into the folder of an evaluation; `command` repeats it, "" if unknown."""
     protocols, revisions = (
         sorted({str(getattr(item, name)) for item in found.estimates}) for name in ("protocol", "revision")
     )
@@ -48,9 +48,9 @@ def write_evaluation_page(out: Path, found: Found, command: str) -> Path:
 
 
 def verdict(found: Found) -> tuple[str, str]:
-    """Judge as `good`, `mixed`, `bad` or `unknown`, and say how many runs are finished and better than the prior alone.
+    """Judge as `good`, `mixed`, `bad` or `unknown`, and count the runs that are finished and better than the raw prior.
 
-    Bad: something is not finished or worse than the gate allows. Mixed: the path of some run is worse than the prior's.
+    Bad: a run is unfinished or worse than the gate allows. Mixed: the path of some run is worse than the prior's.
     """
     done = sum(not job.missing for job in found.jobs)
     words = f"{done} of {len(found.jobs)} runs are finished"
@@ -68,7 +68,7 @@ def verdict(found: Found) -> tuple[str, str]:
 
 
 def run_facts(metrics: Mapping[str, Any]) -> str:
-    """Say the error of the path beside the prior's, and the frames, in one line."""
+    """Describe a run in one line: the path's error beside the prior's, and the frames."""
     ours, raw = (metrics.get(prefix + MAIN[0].key) for prefix in ("", RAW_PRIOR))
     block = metrics.get("provenance", {})
     words = ["no ground truth"] if ours is None else [f"path off by {length_words(ours, block)}"]
@@ -79,7 +79,7 @@ def run_facts(metrics: Mapping[str, Any]) -> str:
 
 
 def _runs(out: Path, jobs: Sequence[JobLine]) -> Table:
-    """Write a line for each run: picture, name, where it lies, what it came to or why not."""
+    """Write a line for each run: picture, name, folder, and its result or why it has none."""
     lines = []
     for job, content in zip(jobs, thumbnails([job.folder / "overview.png" for job in jobs]), strict=True):
         missing = Cell(f"not finished: {job.missing}", "text bad")
@@ -91,7 +91,7 @@ def _runs(out: Path, jobs: Sequence[JobLine]) -> Table:
 
 
 def _errors(rows: Sequence[Row]) -> Table:
-    """Lay out ours, the raw prior and baselines, one below the other; the best of what can be compared is marked."""
+    """Lay out ours, the raw prior and baselines, one below the other; mark the best of comparable values."""
     lines = []
     for row in rows:
         label = "simulated" if row.is_simulated else "measured"

@@ -24,7 +24,7 @@ TOLERANCES = {
     "reconstruction/f1_5cm_percent": {"direction": "higher", "tolerance": 3.0},
     "reconstruction/normals_abs_cos_percent": {"direction": "higher", "tolerance": 2.0},
 }
-_DEVIATIONS = 4.0  # of what rounding does to a mean: a baseline is compared with on other machines
+_DEVIATIONS = 4.0  # of the effect of rounding on a mean, because other machines compare with a baseline
 _FEWEST_PAIRS = 5
 
 
@@ -34,14 +34,14 @@ def rounding_tolerances(
     rounded: Iterable[Estimate],
     num_seeds: int,
 ) -> dict[str, dict[str, Any]]:
-    """Widen tolerances to what rounding alone may do to a mean over `num_seeds` seeds.
+    """Widen tolerances by the effect of rounding alone on a mean over `num_seeds` seeds.
 
-    Seeds differ far more from each other than one of them does from itself on another machine, and a baseline is
-    compared with the same seeds: so it is the differences, job by job, whose root mean square counts.
+    Seeds differ much more from each other than one seed does between machines, and a gate compares the same seeds. So
+    what counts is the root mean square of the differences, job by job.
 
     Args:
-        estimates: of some seeds, better more than those of the baseline.
-        rounded: of the same jobs, computed by other instructions of the processor.
+        estimates: of some seeds, preferably more than those of the baseline.
+        rounded: of the same jobs, computed with other instructions of the processor.
     """
 
     def by_job(some: Iterable[Estimate]) -> dict[tuple, dict[str, float]]:
@@ -64,10 +64,10 @@ def rounding_tolerances(
 
 
 def write_gate(path: str | os.PathLike, rows: Sequence[Row], tolerances: Mapping[str, Mapping[str, Any]]) -> None:
-    """Write the mean of each metric of `tolerances` for our own rows; comments above those of before stay.
+    """Write the mean of each metric of `tolerances` for our own rows; comments at the top of the old file stay.
 
     Args:
-        tolerances: metric -> {direction: lower or higher is better, tolerance: by which it may get worse}.
+        tolerances: metric -> {direction: whether lower or higher is better, tolerance: by how much it may get worse}.
     """
     baseline = {}
     for row in rows:
@@ -84,7 +84,7 @@ def write_gate(path: str | os.PathLike, rows: Sequence[Row], tolerances: Mapping
 
 
 def read_gate(path: str | os.PathLike) -> dict[str, Any]:
-    """Read a baseline by name of its row, from YAML or JSON; raises ValueError where it cannot be compared with."""
+    """Read a baseline, by name of its row, from YAML or JSON; raise ValueError if it is unusable."""
     remedy = "write one with python -m experiments.evaluate … write_gate=FILE"
     if not Path(path).is_file():
         raise ValueError(f"gate={path} is no file: {remedy}")
@@ -102,7 +102,7 @@ def read_gate(path: str | os.PathLike) -> dict[str, Any]:
 
 
 def regressions(baseline: Mapping[str, Any], rows: Sequence[Row]) -> list[str]:
-    """Name each metric that is worse than the baseline allows, or that is missing, in a line."""
+    """Describe each metric that is worse than the baseline allows, or missing, in a line."""
     found = {(_name(row), row.protocol): row for row in rows if row.kind == "ours"}
     lines = []
     for name, entry in baseline.items():

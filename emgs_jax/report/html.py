@@ -1,6 +1,6 @@
-"""Pages: templates of the folder `web/` filled with what a run has to say; every text in them is escaped.
+"""Pages: fill the templates in `web/`; every text in them is escaped.
 
-A page is one file that opens by double click, asks for nothing, and is read without a program, too.
+A page is one file that opens by double click, makes no request, and can be read without running its program, too.
 """
 
 import base64
@@ -22,7 +22,7 @@ from emgs_jax.runs.finished_run import REPORT_FILE
 
 POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 MAX_BYTES = 5_000_000
-PICTURE_BYTES = 3_500_000  # of base64, all pictures of a table together
+PICTURE_BYTES = 3_500_000  # of base64, for all pictures of a table together
 MAX_LINES = 500  # of a table, for the same reason
 _WIDTHS = (360, 240, 160, 100)  # pixels
 _QUALITY = 80  # of JPEG
@@ -50,12 +50,12 @@ class Head(NamedTuple):
 
     window: str
     title: str
-    beside: str  # the title, in small letters
+    beside: str  # subtitle, in small letters
     level: str  # of the verdict: good, mixed, bad or unknown
     verdict: str
     is_simulated: bool
     remarks: Sequence[str]  # empty ones are left out
-    command: str  # repeats what the page shows; "" where nobody knows
+    command: str  # repeats what the page shows; "" if unknown
     sources: Sequence[tuple[str, str]]  # data sets and priors whose licences stand at the foot
 
 
@@ -67,7 +67,7 @@ def page(template: str, head: Head, policy: str = POLICY, **values: Any) -> byte
 
 
 def write_page(folder: Path, content: bytes) -> Path:
-    """Write report.html into a folder; returns its path."""
+    """Write report.html into a folder; return its path."""
     write_file(folder / REPORT_FILE, content)
     return folder / REPORT_FILE
 
@@ -105,20 +105,20 @@ def picture(content: str, words: str) -> Markup:
 
 
 def link(page_folder: Path, path: Path, words: str) -> Markup:
-    """Link to what is there, relatively; nothing where it is not."""
+    """Make a relative link to an existing file; nothing if it is missing."""
     relative = quote(os.path.relpath(path, page_folder).replace(os.sep, "/"))
     return Markup('<a href="./{}">{}</a>').format(relative, words) if path.exists() else Markup()
 
 
 def thumbnails(paths: Sequence[Path], widths: Sequence[int] = _WIDTHS) -> list[str]:
-    """Encode pictures as JPEG in base64, as large as all of them fit; "" where there is none, or no room for it."""
+    """Encode pictures as JPEG in base64, as large as all of them fit; "" for one that is missing or does not fit."""
     images: list[Image.Image | None] = []
     for path in paths:
         try:
             with Image.open(path) as image:
                 images.append(image.convert("RGB"))
             images[-1].thumbnail((widths[0], 4 * widths[0]))
-        except (OSError, SyntaxError, ValueError):  # not there, or damaged; Pillow has all three
+        except (OSError, SyntaxError, ValueError):  # missing or damaged; Pillow raises all three
             images.append(None)
     for width in widths:
         for image in filter(None, images):

@@ -1,4 +1,4 @@
-"""One table of many runs, those of `emgs run -m`: what each was told, and what it came to."""
+"""One table of many runs, those of `emgs run -m`: the settings of each, and its results."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -10,11 +10,11 @@ from emgs_jax.io.files import write_file
 from emgs_jax.report.columns import MAIN, Line, Table, csv_text, known, markdown, metric_table
 from emgs_jax.runs.results import METRICS_FILE, read_metrics
 
-OVERRIDES = Path(".hydra", "overrides.yaml")  # the words of a run, as Hydra keeps them
+OVERRIDES = Path(".hydra", "overrides.yaml")  # the words of a run, as stored by Hydra
 
 
 def runs_of(folder: Path) -> list[Path]:
-    """Folders of the finished runs below a folder, in the order of their numbers."""
+    """Find the finished runs below a folder, in the order of their numbers."""
     found = (path.parent for path in folder.glob(f"*/{METRICS_FILE}"))
     return sorted(found, key=lambda path: (len(path.name), path.name))
 
@@ -23,8 +23,8 @@ def read_multirun(folder: Path) -> tuple[list[str], list[dict[str, Any]]]:
     """Read the finished runs below a folder.
 
     Returns:
-        The keys that have another value in another run, and a flat row for each run: its folder, the values of these
-        keys as they were given ("" where one was not), the data set, then all metrics.
+        The keys that differ between runs, and a flat row for each run: its folder, the values of these keys as given
+        ("" if not given), the data set, then all metrics.
     """
     folders = runs_of(folder)
     given = [dict(word.partition("=")[::2] for word in OmegaConf.load(path / OVERRIDES)) for path in folders]
@@ -42,7 +42,7 @@ def _differs(key: str, given: Sequence[Mapping[str, str]]) -> bool:
 
 
 def table_of(keys: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Lay out the main metrics of all runs; the best of each data set is marked."""
+    """Lay out the main metrics of all runs; mark the best of each data set."""
     lines = [Line([row["run"], *(row[key] for key in keys)], row, rivals=row["data"]) for row in rows]
     return metric_table(["run", *keys], known(MAIN, rows), lines, {row["data"] for row in rows})
 

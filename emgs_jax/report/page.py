@@ -24,18 +24,18 @@ from emgs_jax.runs.moving import frame_facts
 from emgs_jax.runs.repeat import repeat
 
 _MAP_BYTES = 2_800_000  # of base64; the rest is for pictures and words
-_SPLAT_BYTES = 2_400_000  # of these for the splats of emgs polish, where there are some
+_SPLAT_BYTES = 2_400_000  # of these for the splats of emgs polish, if any
 _MAX_PICTURES = 120  # frames, evenly spread
 _SCRIPTS = ("data.js", "vectors.js", "splats.js", "layers.js", "controls.js", "overlay.js", "frames.js", "main.js")
 
 
 def write_report(run: FinishedRun, dataset: Dataset | None, note: str = "") -> Path:
-    """Write report.html into the folder of a run, and return its path; the same run gives the same bytes.
+    """Write report.html into the folder of a run and return its path; the same run gives the same bytes.
 
-    ValueError where parts of the run do not fit each other; then nothing is written.
+    Raises ValueError, and writes nothing, if parts of the run do not fit each other.
 
     Args:
-        dataset: in use, for the images; None: the page has none.
+        dataset: for the images; None: the page has none.
         note: what could not be shown, and why.
     """
     paths = placed_paths(run)
@@ -56,16 +56,16 @@ def write_report(run: FinishedRun, dataset: Dataset | None, note: str = "") -> P
 
 
 def _splats(run: FinishedRun) -> tuple[dict[str, Any] | None, str, str, np.ndarray]:
-    """`splats_for_page` of what `emgs polish` wrote into the run; None without."""
+    """Pack the run's splats of `emgs polish` by `splats_for_page`; None without splats."""
     splats = read_splats(run.folder / SPLATS_FILE)
     if splats is None or not len(splats.means):
         return None, "", "", np.zeros((0, 3))
     about, *rest = splats_for_page(splats, _SPLAT_BYTES)
-    return about | {"render": {"blur": 0.3, "radius": 3.0, "opacity": 1.0}}, *rest  # as 3DGS draws
+    return about | {"render": {"blur": 0.3, "radius": 3.0, "opacity": 1.0}}, *rest  # as 3DGS renders
 
 
 def _path_arrays(run: FinishedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
-    """Collect the upper three rows of poses (n, 12), float32, in the frame of the map; only what is known."""
+    """Collect the upper three rows of the known poses (n, 12), float32, in the frame of the map."""
     found = {"poses": run.poses, "online": run.online, "truth": paths.truth, "raw": paths.raw}
     return {
         name: poses[:, :3].reshape(-1, 12).astype(np.float32)
@@ -75,7 +75,7 @@ def _path_arrays(run: FinishedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
 
 
 def _about(run: FinishedRun, layers: dict[str, np.ndarray]) -> dict[str, Any]:
-    """Collect the data that the page's program needs, beside the attributes of Gaussians."""
+    """Collect the data that the page's program needs, besides the attributes of Gaussians."""
     means = layers["mean"].astype(np.float64) if len(layers["mean"]) else run.poses[:, :3, 3]
     low, high = np.percentile(np.concatenate([means, run.poses[:, :3, 3]]), [1, 99], axis=0)
     rotation = view_from_above(run.poses)
@@ -119,7 +119,7 @@ def _page(
     (overview,) = thumbnails([run.folder / "overview.png"], (1200,))
     shown_paths = {array["name"] for array in about["arrays"]} | ({"loops"} if about["loops"] else set())
     values = {
-        "overview": picture(overview, "the map from above, and some frames"),  # for who reads without a program
+        "overview": picture(overview, "the map from above, and some frames"),  # for reading without the program
         "layers": layers_of({array["name"] for array in about["arrays"]}),
         "paths": {name: look for name, look in PATHS.items() if name in shown_paths},
         "depths": f"{views.near:.1f} to {views.far:.1f} {'m' if run.is_metric else 'units'}",

@@ -1,4 +1,4 @@
-"""Small pictures for the page: what the camera saw, what the map shows from there, and how far away it is."""
+"""Small pictures for the page: the camera's image, and the map's colours and depth from the same pose."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -22,12 +22,12 @@ from emgs_jax.report.html import jpeg
 from emgs_jax.runs.finished_run import FinishedRun
 from emgs_jax.runs.moving import with_moving
 
-WIDTH = 200  # pixels; a picture is not wider
+WIDTH = 200  # pixels; largest width of a picture
 _NO_DEPTH = (221, 221, 221)
 
 
 class Picture(NamedTuple):
-    """JPEGs in base64 of one frame; "" where there is none."""
+    """JPEGs of one frame in base64; "" for a missing one."""
 
     row: int
     seen: str
@@ -36,7 +36,7 @@ class Picture(NamedTuple):
 
 
 class Views(NamedTuple):
-    """Pictures, and the depths [m] of the first and last colour."""
+    """Pictures, and the depths [m] at both ends of the colour scale."""
 
     pictures: list[Picture]
     near: float
@@ -50,7 +50,7 @@ def _drawn(gaussians: Gaussians, pose: jaxlie.SE3, camera: Camera, config: Rende
 
 
 def draw_views(run: FinishedRun, rows: Sequence[int], config: RenderConfig, dataset: Dataset | None) -> Views:
-    """Draw the map of a run by our own renderer from frames that are placed, beside the images of a data set."""
+    """Render the map of a run from placed frames, beside the images of a data set."""
     small, placed = downscale(run.camera, -(-run.camera.width // WIDTH)), run.is_placed
     gaussians = closed(confirmed(run.map))
     known = [row for row in rows if placed[row]]
@@ -73,14 +73,14 @@ def _seen(dataset: Dataset | None, row: int, line: Mapping[str, Any]) -> str:
         return ""
     try:
         image = Image.fromarray(with_moving(dataset[row].image, line))
-    except (BadFrameError, OSError):  # gone since the run
+    except (BadFrameError, OSError):  # removed since the run
         return ""
     image.thumbnail((WIDTH, WIDTH * image.height), Image.Resampling.BOX)
     return jpeg(np.asarray(image))
 
 
 def _painted(depth: np.ndarray, near: float, far: float) -> np.ndarray:
-    """Colour depth, uint8 (h, w, 3); grey where there is none."""
+    """Colour depth, uint8 (h, w, 3); grey for none."""
     share = (depth - near) / max(far - near, 1e-9)
     colors = to_bytes(matplotlib.colormaps["turbo"](share)[..., :3])
     return np.where((depth > 0)[..., None], colors, np.uint8(_NO_DEPTH))

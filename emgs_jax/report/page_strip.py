@@ -1,4 +1,4 @@
-"""Frames in time: their statuses, curves and loops as shapes, which web/run.html draws as SVG without a program."""
+"""Frames over time: statuses, curves and loops as shapes, which web/run.html draws as SVG without a program."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -10,7 +10,7 @@ from emgs_jax.report.page_words import loop_words
 from emgs_jax.runs.finished_run import FinishedRun
 from emgs_jax.runs.provenance import has_metric_truth
 
-HEIGHT = 100.0  # units of a row's picture; one unit across is a frame
+HEIGHT = 100.0  # units of a row's picture; horizontally one unit is one frame
 ERRORS = {"raw": "raw prior", "online": "as placed", "ours": "ours"}
 _COLORS = {name: PATHS["poses" if name == "ours" else name].paper for name in ERRORS}
 
@@ -26,7 +26,7 @@ class Shape(NamedTuple):
 
 
 class Row(NamedTuple):
-    """A line of the strip: its label with a unit, pixels in height, its range from above, and its picture."""
+    """A line of the strip: its label with a unit, height in pixels, range from the top, and picture."""
 
     label: str
     unit: str
@@ -36,7 +36,7 @@ class Row(NamedTuple):
 
 
 def strip(run: FinishedRun, errors: dict[str, np.ndarray]) -> list[Row]:
-    """Draw statuses, errors of positions [m] by name, numbers of the frames that there are, and loops."""
+    """Draw statuses, errors of positions [m] by name, the frames' numbers, and loops."""
     ends = [f"{run.frames[0]['index']} – {run.frames[-1]['index']}"] if run.frames else []
     rows = [Row("frames", "", 20, ends, _statuses(run))]
     if errors:
@@ -45,7 +45,7 @@ def strip(run: FinishedRun, errors: dict[str, np.ndarray]) -> list[Row]:
         rows.append(_curves("error of the position", unit, curves, 64))
     names = "inliers", "residual", "scale", "moving", "new", "seconds", "compile_seconds"
     inliers, residual, scale, moving, new, seconds, compiling = (_numbers(run, name) for name in names)
-    residual[inliers == 0] = np.nan  # of nothing
+    residual[inliers == 0] = np.nan  # undefined without inliers
     moving = np.where((moving > 0).any(), moving, np.nan)
     for label, unit, values in (
         ("inliers", "points", inliers),
@@ -73,7 +73,7 @@ def _numbers(run: FinishedRun, name: str) -> np.ndarray:
 
 
 def _statuses(run: FinishedRun) -> list[Shape]:
-    """Draw runs of one status as one rectangle."""
+    """Draw consecutive frames of one status as one rectangle."""
     words = [line["status"] for line in run.frames]
     starts = [0, *(row for row in range(1, len(words)) if words[row] != words[row - 1])]
     shapes = []
@@ -86,7 +86,7 @@ def _statuses(run: FinishedRun) -> list[Shape]:
 
 
 def _curves(label: str, unit: str, curves: dict[str, np.ndarray], height: int, from_zero: bool = True) -> Row:
-    """Draw numbers of each frame (n,), nan where there is none, over one range."""
+    """Draw numbers of each frame (n,), nan for none, over one range."""
     finite = np.concatenate([values[np.isfinite(values)] for values in curves.values()])
     low, high = 0.0 if from_zero else float(finite.min()), float(finite.max())
     span = high - low if high > low else 1.0
@@ -98,7 +98,7 @@ def _curves(label: str, unit: str, curves: dict[str, np.ndarray], height: int, f
 
 
 def _line(shares: np.ndarray) -> str:
-    """Draw a curve of values in [0, 1], broken where there is none; one between two gaps is a dash of one column."""
+    """Draw a curve of values in [0, 1], broken at gaps; a value between two gaps is a dash of one column."""
     y = HEIGHT * (0.96 - 0.92 * shares)
     rows = np.flatnonzero(np.isfinite(y))
     pieces = np.split(rows, np.flatnonzero(np.diff(rows) > 1) + 1) if len(rows) else []

@@ -27,7 +27,7 @@ from emgs_jax.runs.repeat import Repeated
 from emgs_jax.runs.results import sound
 
 MANY_LOST = 0.1  # share of the frames
-MAX_LOOPS = 500  # that are named
+MAX_LOOPS = 500  # largest number listed
 _SE3 = Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
 _COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), _SE3, *PLACED[:1], *PLACED[3:4], *BY_PATH, *RENDERED)
 FILES = {
@@ -62,14 +62,14 @@ OUTCOMES = {
 
 
 def loop_why(loop: dict[str, Any]) -> str:
-    """Say the outcome of a loop candidate, and its reason."""
+    """Describe the outcome of a loop candidate, and its reason."""
     gate = str(loop.get("gate", ""))
     why = f"refused: {GATES.get(gate, gate)}" if loop["outcome"] == "refused" else OUTCOMES[loop["outcome"]]
     return f"{why}: {loop['reason']}" if loop.get("reason") else why
 
 
 def loop_words(run: FinishedRun, loop: dict[str, Any]) -> str:
-    """Name frames, by their index in the data set as everywhere on the page, outcome and reason."""
+    """Describe a loop: frames by their index in the data set, as everywhere on the page, outcome and reason."""
     frame, other = (run.frames[loop[name]]["index"] for name in ("frame", "other"))
     return f"frames {frame} and {other}: {loop_why(loop)}"
 
@@ -77,8 +77,8 @@ def loop_words(run: FinishedRun, loop: dict[str, Any]) -> str:
 def verdict(run: FinishedRun) -> tuple[str, str]:
     """Judge as `good`, `mixed`, `bad` or `unknown`, in one sentence; without ground truth by the tracking alone.
 
-    Bad: more than a tenth of the frames is lost, or the path is worse than the raw prior's. Mixed: of the true depth
-    fewer pixels are met than by the raw prior, or a tenth of the frames is degraded.
+    Bad: more than a tenth of the frames is lost, or the path is worse than the raw prior's. Mixed: fewer pixels have
+    the true depth than in the raw prior, or a tenth of the frames is degraded.
     """
     metrics, statuses = run.metrics, Counter(line["status"] for line in run.frames)
     total = max(len(run.frames), 1)
@@ -123,7 +123,7 @@ def head(run: FinishedRun, again: Repeated) -> Head:
 
 
 def errors(run: FinishedRun) -> Table | None:
-    """Compare our errors, those as placed, of the raw prior and of baselines, one beside the other; None without."""
+    """Lay out our errors, and those of online poses, raw prior and baselines, side by side; None without any."""
     metrics = run.metrics
     if not any(MAIN[0].key in key for key in metrics):
         return None
@@ -136,7 +136,7 @@ def errors(run: FinishedRun) -> Table | None:
 
 
 def protocol_words(run: FinishedRun) -> str:
-    """Say how errors are measured."""
+    """Describe how errors are measured."""
     config = run.provenance["config"].get("evaluation", {})
     statistic, num_frames = config.get("statistic", "mean"), run.metrics.get("trajectory/num_frames")
     return (
@@ -147,7 +147,7 @@ def protocol_words(run: FinishedRun) -> str:
 
 
 def loops(run: FinishedRun) -> tuple[Table, str, list[str]] | None:
-    """Candidates of loops: counts of their outcomes, what came of them, and each in words; None without a back end."""
+    """Describe loop candidates: counts of outcomes, their effect, and each in words; None without a back end."""
     if not run.loops:
         return None
     counts = Counter(map(loop_why, run.loops)).most_common()
@@ -164,7 +164,7 @@ def settings(again: Repeated) -> Table:
 
 
 def polished(run: FinishedRun) -> tuple[Table, str] | None:
-    """Compare map and splats of `emgs polish` on the frames that it held out; None where it was not run."""
+    """Compare map and splats of `emgs polish` on the frames that it held out; None if it was not run."""
     path = run.folder / POLISH[1]
     if not path.is_file():
         return None

@@ -1,4 +1,4 @@
-"""Messages at the end of a run: how many frames have which status, and remedies where many were not tracked."""
+"""Messages at the end of a run: frames by status, and remedies if many were not tracked."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -31,9 +31,9 @@ POLISHED = (  # key of polish.json, words, digits
 
 
 def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
-    """One line of counts; where many frames are degraded or lost, one more with the most frequent reason and a remedy.
+    """Return one line of counts; if many frames are degraded or lost, one more with the main reason and a remedy.
 
-    Many are a tenth of all, or `MANY_IN_A_ROW`; these are named, too.
+    Many means a tenth of all, or `MANY_IN_A_ROW`, which are named, too.
     """
     counts = Counter(record.status for record in records) | Counter(skipped=num_skipped)
     words = ("tracked", "degraded", "lost", "initialization", "skipped", *[APART] * bool(counts[APART]))
@@ -62,14 +62,14 @@ def frame_lines(records: Sequence[FrameRecord], num_skipped: int) -> list[str]:
 
 
 def time_words(clock: Clock, num_frames: int) -> str:
-    """Describe how long a run took, per frame, by phase, and how much of it was compilation."""
+    """Describe the time of a run: per frame, by phase, and for compilation."""
     whole, phases = sum(clock.phases.values()), ", ".join(f"{name} {s:.1f}" for name, s in clock.phases.items())
     pace = f"{whole:.1f} s, {whole / max(num_frames, 1):.2f} s a frame"
     return f"{pace}: {phases}; of all that compilation {clock.compile_seconds:.1f}"
 
 
 def last_words(metrics: Mapping[str, Any]) -> str:
-    """Say for a run's last line how many frames are not in the map and from which on; empty where all are."""
+    """Say for a run's last line how many frames are not in the map, and from which one on; empty if all are."""
     count = metrics["frames/degraded"] + metrics["frames/lost"]
     if not count:
         return ""
@@ -82,10 +82,10 @@ def last_words(metrics: Mapping[str, Any]) -> str:
 
 
 def metrics_table(metrics: Mapping[str, Any]) -> str:
-    """Lay out the main metrics, one row for the map, the raw prior and each baseline; `–` where there is no value.
+    """Lay out the main metrics, one row for the map, the raw prior and each baseline; `–` for a missing value.
 
-    First come clouds placed by their points (ICP), as in the README, below the same rows placed by the path, and what
-    is rendered of them at their own poses.
+    Clouds aligned by ICP come first, as in the README; below are the same rows aligned by trajectory, and renderings at
+    their own poses.
     """
     block, tables = metrics.get("provenance", {}), []
     names = [str((block.get("data") or {}).get("name"))]
@@ -96,7 +96,7 @@ def metrics_table(metrics: Mapping[str, Any]) -> str:
 
 
 def _label(block: Mapping[str, Any]) -> str:
-    """Label a table: empty for measured numbers; `simulated`, with any version, for others."""
+    """Label a table: empty for measured numbers, otherwise `simulated` with its version."""
     if not block.get("simulated", False):
         return ""
     name = (block.get("prior") or {}).get("name", "")
@@ -104,7 +104,7 @@ def _label(block: Mapping[str, Any]) -> str:
 
 
 def polish_lines(found: Mapping[str, Any]) -> list[str]:
-    """Lines of what polish.json says of the frames that were held out."""
+    """Describe the held-out frames by polish.json, in lines."""
     lines = [f"{found['polish/num_splats']:,} splats; of {found['polish/num_held_out']} frames that were not fitted:"]
     lines.append(aligned(polish_table(found)))
     if found["polish/after_psnr_db"] < found["polish/before_psnr_db"]:
@@ -113,7 +113,7 @@ def polish_lines(found: Mapping[str, Any]) -> list[str]:
 
 
 def polish_table(found: Mapping[str, Any]) -> Table:
-    """Map and splats beside each other on the frames that were held out, by polish.json."""
+    """Lay out map and splats side by side on the held-out frames, by polish.json."""
     rows = [
         (words, *(f"{float(found[f'polish/{when}_{name}']):.{digits}f}" for when in ("before", "after")))
         for name, words, digits in POLISHED

@@ -1,4 +1,4 @@
-"""Numbers that papers print, beside which tables show ours."""
+"""Published numbers, to show beside ours."""
 
 from pathlib import Path
 from typing import Any
@@ -7,6 +7,6 @@ import yaml
 
 
 def published(table: str) -> list[dict[str, Any]]:
-    """Rows of `reconstruction` (Table II and the peers' own papers) or `segmentation` (Table III): published.yaml."""
+    """Read published.yaml: rows of `reconstruction` (Table II, the peers' own papers) or `segmentation` (Table III)."""
     text = Path(__file__).with_suffix(".yaml").read_text(encoding="utf-8")
     return yaml.safe_load(text)[table]

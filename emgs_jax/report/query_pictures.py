@@ -1,4 +1,4 @@
-"""Pictures of an answer: where a map is relevant for a word, seen from any pose, and the map's features as colours."""
+"""Pictures of an answer: relevance of the map for a word from any pose, and the map's features as colours."""
 
 import itertools
 from collections.abc import Mapping, Sequence
@@ -26,8 +26,8 @@ from emgs_jax.semantics import principal_colors
 
 QUERY_PICTURE, FEATURES_PICTURE = "query.png", "features.png"
 LABELS_FOLDER, CLASSES_FILE = "labels", "classes.txt"
-WORDS_AT_ONCE = 16  # that are drawn together
-MAX_POSES, SMALL_WIDTH = 60, 64  # poses that are looked from, evenly spread, and columns of those images
+WORDS_AT_ONCE = 16  # drawn together
+MAX_POSES, SMALL_WIDTH = 60, 64  # number of poses tried, evenly spread, and width of their images
 MAX_LEGEND, KEYS_PER_LINE = 24, 6  # words of a legend
 _colors = eqx.filter_jit(principal_colors)
 
@@ -48,7 +48,7 @@ def _drawn(
 
 
 def drawn(run: FinishedRun, gaussians: Gaussians, values: np.ndarray, view: View, camera: Camera) -> np.ndarray:
-    """Draw values (n, v) of the Gaussians as an image (h, w, v); nan where the map shows nothing."""
+    """Render values (n, v) of the Gaussians as an image (h, w, v); nan where the map shows nothing."""
     config, pose = render_config(run), to_se3(view.pose)
     values, alpha = jax.device_get(_drawn(gaussians, jnp.asarray(values, jnp.float32), pose, camera, config))
     is_seen = alpha >= max(float(config.min_alpha), 1e-6)
@@ -63,7 +63,7 @@ def views_of(run: FinishedRun) -> list[View]:
 
 
 def frame_view(run: FinishedRun, frame: int) -> View:
-    """Return the pose of one frame; raises ValueError where the run has none."""
+    """Return the pose of one frame; raise ValueError if the run has none."""
     known = [line["index"] for line in run.frames]
     if frame not in known:
         raise ValueError(f"{run.folder} has no pose of frame={frame}: choose one from {min(known)} to {max(known)}")
@@ -71,7 +71,7 @@ def frame_view(run: FinishedRun, frame: int) -> View:
 
 
 def best_views(run: FinishedRun, answer: Answer, count: int) -> list[list[View]]:
-    """Find for each word the poses from which most pixels answer it, best first; none where there is no answer."""
+    """Find for each word the poses from which most pixels answer, best first; none without an answer."""
     camera = downscale(run.camera, -(-run.camera.width // SMALL_WIDTH))
     words = len(answer.question.words.names)
     answers = answer.relevance.labels[:, None] == np.arange(words)
@@ -83,7 +83,7 @@ def best_views(run: FinishedRun, answer: Answer, count: int) -> list[list[View]]
 
 
 def draw_answer(path: Path, run: FinishedRun, answer: Answer, views: Sequence[Sequence[View]], max_words: int) -> int:
-    """Draw a line for each word and view: the map, the word's relevance, the classes; returns how many words."""
+    """Draw a line for each word and view: map, relevance of the word, classes; return the number of words."""
     names, has_classes = answer.question.words.names, len(views) > 1
     counts = [(answer.relevance.labels == word).sum() for word in range(len(views))]
     words = sorted(map(int, np.argsort(-np.array(counts), kind="stable")[:max_words]))
@@ -99,9 +99,9 @@ def draw_answer(path: Path, run: FinishedRun, answer: Answer, views: Sequence[Se
 
 
 def save_labels(folder: Path, run: FinishedRun, answer: Answer, views: Mapping[str, View]) -> None:
-    """Write which word the map answers with at each pixel, as class images that `features.folder` and others read.
+    """Write the map's word at each pixel as class images, which `features.folder` and others read.
 
-    NAME.png holds 16-bit ids, 1 for the first word and so on, 0 where the map shows nothing or none of the words;
+    NAME.png holds 16-bit ids, 1 for the first word and so on, 0 for none of them or where the map shows nothing;
     classes.txt has a line `id word` for each.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -112,11 +112,11 @@ def save_labels(folder: Path, run: FinishedRun, answer: Answer, views: Mapping[s
 
 
 def label_image(run: FinishedRun, answer: Answer, view: View) -> np.ndarray:
-    """Draw the word (h, w) with the largest share of each pixel, from 1; 0 where that is none of them, or nothing."""
+    """Draw the number of the word with the largest share of each pixel (h, w), from 1; 0 for none of them."""
     labels, count = answer.relevance.labels + 1, len(answer.question.words.names) + 1
     best, found = np.zeros((run.camera.height, run.camera.width)), np.zeros((run.camera.height, run.camera.width), int)
     for first in range(0, count, WORDS_AT_ONCE):
-        words = np.arange(first, first + WORDS_AT_ONCE)  # as many each time: one compilation
+        words = np.arange(first, first + WORDS_AT_ONCE)  # the same number each time, for one compilation
         share = np.nan_to_num(drawn(run, answer.gaussians, labels[:, None] == words, view, run.camera))
         found = np.where(share.max(-1) > best, words[share.argmax(-1)], found)
         best = np.maximum(best, share.max(-1))
@@ -132,7 +132,7 @@ def draw_features(path: Path, run: FinishedRun, views: Sequence[View]) -> None:
 
 
 def legend(names: Sequence[str], counts: Sequence[int]) -> dict[str, np.ndarray]:
-    """Return the colours of `painted` by word: those with the most answers, in the order of the words."""
+    """Return the colours of `painted` for the words with most answers, in the order of the words."""
     most = sorted(np.argsort(-np.array(counts), kind="stable")[:MAX_LEGEND])
     return {names[word]: class_colors(len(names))[word] for word in most if counts[word]}
 
@@ -140,7 +140,7 @@ def legend(names: Sequence[str], counts: Sequence[int]) -> dict[str, np.ndarray]
 def _save(
     path: Path, lines: Sequence[Sequence[tuple[str, np.ndarray]]], legend: Mapping[str, np.ndarray] | None = None
 ) -> None:
-    """Write titled images in lines of one length above a legend, as PNG; nothing to draw makes a line of text."""
+    """Write titled images in lines of equal length above a legend, as PNG; without images, a line of text."""
     columns = max((len(line) for line in lines), default=1)
     height, width = lines[0][0][1].shape[:2] if lines else (1, 4)
     handles = [Patch(color=color, label=name) for name, color in (legend or {}).items()] if lines else []

@@ -1,4 +1,4 @@
-"""Finished maps against true classes, scene by scene, and the table that stands beside the paper's Table III."""
+"""Score finished maps against true classes, scene by scene, and make the counterpart of the paper's Table III."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -38,8 +38,8 @@ class Placement:
     """Alignment of a map with the truth: by the `trajectory`, or from there by a rigid ICP of the `points`."""
 
     by: str
-    with_scale: bool  # the alignment of the poses estimates a scale, too
-    icp_distance_m: float  # pairs of ICP are nearer than this
+    with_scale: bool  # also estimate a scale when aligning the poses
+    icp_distance_m: float  # largest distance of ICP's pairs
     icp_max_steps: int
 
 
@@ -48,19 +48,19 @@ class Counting:
     """OVO's protocol: each true point takes the most frequent class of the map's nearest points with a class.
 
     Args:
-        num_neighbours: of the map, that vote for a true point.
-        ignored: names whose true points do not count.
+        num_neighbours: nearest points of the map that vote for a true point.
+        ignored: names of classes whose true points do not count.
     """
 
     num_neighbours: int
     ignored: tuple[str, ...]
 
     def ignored_rows(self, classes: Sequence[str]) -> list[int]:
-        """Return the positions of the ignored names; those that are no classes are skipped."""
+        """Return the positions of the ignored names, skipping those that are no classes."""
         return [row for row, name in enumerate(classes) if name in self.ignored]
 
     def metrics(self, confusion: np.ndarray, classes: Sequence[str]) -> dict[str, float | None]:
-        """mIoU, f-mIoU and Acc in percent of one matrix; None without any true point."""
+        """Compute mIoU, f-mIoU and Acc of a matrix in percent; None without any true point."""
         found = segmentation_metrics(confusion, self.ignored_rows(classes))
         return {name: found[f"segmentation/{key}_percent"] for name, key in _KEYS.items()}
 
@@ -72,13 +72,13 @@ class SceneResult:
     scene: str
     folder: str
     is_simulated: bool
-    confusion: np.ndarray  # (c, c + 1), see `segmentation`; one a scene, and they are added
+    confusion: np.ndarray  # (c, c + 1), see `segmentation`; those of all scenes are added
     about: dict[str, Any]
     ate_m: float | None
 
 
 def place(run: FinishedRun, truth: np.ndarray, how: Placement) -> tuple[np.ndarray, dict[str, Any]]:
-    """Move the confirmed Gaussians' centres (n, 3) to true points (m, 3); says how. ValueError without true poses."""
+    """Align the confirmed Gaussians' centres (n, 3) with true points (m, 3); say how. ValueError without true poses."""
     known = run.has_truth
     if not known.any():
         raise ValueError(f"{run.folder}/frames.jsonl has no true pose to place the map by: map a data set with truth")
@@ -103,7 +103,7 @@ def score_scene(
 ) -> SceneResult:
     """Compare the map of a run with the true points of its scene.
 
-    `vectors` (c, f) are text embeddings of the truth's classes.
+    `vectors` (c, f) are text embeddings of the true classes.
     """
     points, about = place(run, truth.points, how)
     gaussians = confirmed(run.map)

@@ -57,16 +57,17 @@ class Row:
     prior: str | None
     is_simulated: bool
     protocol: str
-    sequences: tuple[str, ...]  # over which each seed's value is the mean
-    seeds: tuple[int, ...]  # that have a result for each of the sequences
-    values: dict[str, float | None]  # metric -> mean over the seeds, None where one has none
+    sequences: tuple[str, ...]  # averaged within each seed
+    seeds: tuple[int, ...]  # with a result for each of the sequences
+    values: dict[str, float | None]  # metric -> mean over the seeds; None if any seed lacks it
     spreads: dict[str, float | None]  # metric -> standard deviation over the seeds, None for fewer than two
 
 
 def average(estimates: Iterable[Estimate], each_sequence: bool) -> list[Row]:
     """Average over seeds, in the order of the estimates: all sequences of a data set together, or each by itself.
 
-    A seed counts if it has a result for every sequence that any seed has: means over different sequences differ.
+    A seed counts only if it has a result for every sequence that any seed has, because means over different sequences
+    are not comparable.
     """
     groups: dict[tuple, list[Estimate]] = defaultdict(list)
     for item in estimates:
@@ -76,7 +77,7 @@ def average(estimates: Iterable[Estimate], each_sequence: bool) -> list[Row]:
 
 
 def to_csv(estimates: Sequence[Estimate]) -> str:
-    """Write one line per estimate: what it is of, then every metric."""
+    """Write one CSV line per estimate: its origin, then every metric."""
     names = ("dataset", "sequence", "variant", "kind", "seed", "prior", "is_simulated", "protocol", "revision")
     return csv_text([{name: getattr(item, name) for name in names} | item.values for item in estimates])
 
@@ -116,7 +117,7 @@ def full_table(rows: Sequence[Row]) -> str:
 
 
 def over(sequences: Sequence[str]) -> str:
-    """Name the sequence of a row, or say of how many it is the mean."""
+    """Name the sequence of a row, or the number of sequences that it averages."""
     return sequences[0] if len(sequences) == 1 else f"mean of {len(sequences)}"
 
 

@@ -1,1 +1,1 @@
-"""Runs on disk: their files written, read, merged, exported, polished and asked for words."""
+"""Runs on disk: write, read, merge, export, polish and query them."""

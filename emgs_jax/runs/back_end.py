@@ -1,4 +1,4 @@
-"""Report of the back end: its pose graph, and outcomes of loop candidates for graph.g2o, loops.json, metrics.json."""
+"""Report of the back end: pose graph and outcomes of loop candidates, for graph.g2o, loops.json and metrics.json."""
 
 from collections import Counter
 from dataclasses import replace
@@ -17,7 +17,7 @@ from emgs_jax.pose_graph.factors import PoseGraph
 
 
 def metric_graph(end: BackEnd) -> PoseGraph:
-    """Poses and measurements in the map's scale, without scales of their own: what other solvers read."""
+    """Convert poses and measurements to the map's scale, without scales of their own, as other solvers need."""
 
     def scaled(edge: Factor) -> Factor:
         scale = np.exp(end.nodes[edge.a].log_scale)
@@ -33,9 +33,9 @@ def metric_graph(end: BackEnd) -> PoseGraph:
 def loop_list(end: BackEnd) -> list[dict[str, Any]]:
     """List the outcome of every loop candidate, for loops.json, in the order of the frames.
 
-    `frame` and `other` are positions among the frames in use, the later first; `outcome` is accepted, known (the poses
-    agreed with it already), unconfirmed (not spatially consistent with other loops), unsolved (no better poses were
-    found with it; `reason` says why) or refused; then `gate` names the gate and `measured` is the value that it tested.
+    `frame` and `other` are positions among the frames in use, the later first. `outcome` is accepted, known (the poses
+    already agreed), unconfirmed (not spatially consistent with other loops), unsolved (the solver found no better
+    poses; `reason` says why) or refused; then `gate` names the gate and `measured` is the value that it tested.
     """
     lines = [(loop.b, loop.a, said) for loop, said in zip(end.verified, _outcomes(end), strict=True)]
     for a, b, gate, measured in end.refusals:
@@ -43,18 +43,18 @@ def loop_list(end: BackEnd) -> list[dict[str, Any]]:
     return [
         {"frame": end.nodes[b].frame, "other": end.nodes[a].frame} | said
         for b, a, said in sorted(lines, key=lambda line: line[:2])
-        if a >= end.first_node  # what is older is of another run
+        if a >= end.first_node  # older ones are of another run
     ]
 
 
 def found_loops(end: BackEnd) -> list[LoopMeasurement]:
-    """The loops that are believed: what is accepted, and what is known, since the poses say so without it."""
+    """Select the accepted loops, and the known ones, with which the poses already agreed."""
     outcomes = zip(end.verified, _outcomes(end), strict=True)
     return [*end.accepted, *(loop for loop, said in outcomes if said["outcome"] == "known")]
 
 
 def _outcomes(end: BackEnd) -> list[dict[str, str]]:
-    """What `loop_list` says of every verified loop."""
+    """Return the outcome of every verified loop, for `loop_list`."""
     accepted, agreed = ({(loop.a, loop.b) for loop in loops} for loops in (end.accepted, consistent_loops(end)))
     reasons = {(loop.a, loop.b): one.info.reason for one in end.closures if one.info.reason for loop in one.loops}
 
@@ -67,7 +67,7 @@ def _outcomes(end: BackEnd) -> list[dict[str, str]]:
 
 
 def revisit_note(end: BackEnd | None) -> list[str]:
-    """A line where the prior could be asked for no loop, and how it can; none where it was asked."""
+    """Return a line, with the remedy, if the prior answered none of the queries for loops; otherwise no line."""
     if end is None or set(end.queries.values()) != {SILENT}:
         return []
     why = f"loops: {len(end.queries)} were measured by keypoints alone, because the prior has no answer for both"
@@ -75,7 +75,7 @@ def revisit_note(end: BackEnd | None) -> list[str]:
 
 
 def counts(end: BackEnd) -> dict[str, Any]:
-    """Count the outcomes of this run's loop candidates, for metrics.json, without those of a loaded map."""
+    """Count the outcomes of this run's loop candidates for metrics.json, without those of a loaded map."""
     gates, answers = Counter(refusal.gate for refusal in end.refusals), Counter(end.queries.values())
     is_refused = Counter(bool(closure.info.reason) for closure in end.closures if closure.loops)
     loops = {"verified": end.verified, "contradicted": end.violating, "accepted": end.accepted}

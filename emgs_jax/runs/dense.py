@@ -1,4 +1,4 @@
-"""The map as points: what is rendered of it from the poses of its frames, its centres, and their classes."""
+"""The map as points: densified from the poses of its frames, its centres, and their classes."""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
@@ -29,7 +29,7 @@ _densify = eqx.filter_jit(densify)
 
 @dataclass(frozen=True)
 class DenseMap:
-    """The map as points: a point per pixel of every frame whose pose is known, averaged per voxel."""
+    """The map as points: one per pixel of every frame with a known pose, averaged in voxels."""
 
     cloud: PointCloud  # in the colours of the images
     labels: LabelledPoints | None = None  # class of each of its points; None without classes
@@ -49,11 +49,11 @@ def dense_map(
     """Render the map from the pose of every frame that is not lost.
 
     Args:
-        evaluation: points of one of its voxels, of the truth where that is known, are averaged, and views are
-            compared with the truth under it.
-        labelled: `labelled_map` of the run, which says the class of each point.
-        own: what the prior says of every frame, camera-frame points (h, w, 3) in its own lengths, 0 where it says
-            nothing; for `densify.points=own` only.
+        evaluation: its voxels average points (metres of the truth if that is known), and views are compared with the
+            truth under it.
+        labelled: `labelled_map` of the run, which classifies points.
+        own: raw points of every frame, camera frame, (h, w, 3) in the prior's lengths, 0 for none; only for
+            `densify.points=own`.
     """
     if config.points != "map" and own is None:
         raise ValueError(f"densify.points={config.points} takes the points of the frames: give own=")
@@ -67,7 +67,7 @@ def dense_map(
         for row, view in zip(known, _drawn(run, known, config), strict=True):
             labels = found = None
             if labelled is not None and (row in shown or compares_classes):
-                # At the rim of what was seen the coverage is too little for a depth, and enough for a class.
+                # At the border of the map the coverage is too low for a depth, but enough for a class.
                 labels = np.full(view.covered.shape, -1)
                 labels[view.covered] = labelled.classes_of(view.points[view.covered].astype(np.float64))
                 found = translate(labels, labelled.classes, dataset.classes) if compares_classes else None
@@ -102,19 +102,18 @@ def dense_map(
 def uncontradicted(
     points: np.ndarray, view: DenseView, camera: Camera, surface_depth: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The points of a frame that the map does not contradict, and the map's normals there.
+    """Keep the points of a frame that the map does not contradict; also return the map's normals there.
 
-    The mean of W depths of variance σ² whose errors have the correlation ρ has the variance σ² (ρ + (1 - ρ) / W). Where
-    frames err alike, as those of multi-view stereo do, which are matched with the same images, ρ is near 1: the mean is
-    no more precise than any of them, and what is smaller than a Gaussian is missing in it. There the map says which
-    points are right, and the frame where they are (two gates, as in the geometric and photometric consistency of
-    COLMAP, Schönberger et al. 2016). Where the map shows nothing, as at the rim of what few frames see, it contradicts
-    nothing.
+    The mean of W depths of variance σ² and correlation ρ has the variance σ² (ρ + (1 - ρ) / W). If frames share errors,
+    as in multi-view stereo, where they are matched with the same images, ρ is near 1. Then the mean is no more precise
+    than any of them, and lacks what is smaller than a Gaussian. In that case the map decides which points are right,
+    and the frame where they are (two gates, like geometric and photometric consistency in COLMAP, Schönberger et al.
+    2016). Where the map shows nothing, as at the border of what few frames see, it contradicts nothing.
 
     Args:
-        points: of the frame, camera frame, (h, w, 3) in the map's lengths; 0 where there is none. They need not lie on
-            the rays of the camera.
-        view: the map as it is drawn from the frame's pose, on the host.
+        points: of the frame, camera frame, (h, w, 3) in the map's lengths; 0 for none. They need not lie on the rays of
+            the camera.
+        view: the map, rendered from the frame's pose, on the host.
         surface_depth: fraction of the map's depth by which a point may differ from it.
 
     Returns:
@@ -130,7 +129,7 @@ def uncontradicted(
 
 
 def _voxel(poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig) -> float:
-    """Side of a voxel in the map's lengths: `voxel_m`, of the truth where the map's unit is larger than a metre."""
+    """Compute a voxel's side in the map's lengths: `voxel_m`, of the truth if the map's unit is larger than a metre."""
     if poses is None:
         return config.voxel_m
     return min(config.voxel_m, own_voxel(align_poses(*poses, with_scale=True)[0], config))
@@ -139,12 +138,12 @@ def _voxel(poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig
 def _drawn(run: MappingRun, rows: list[int], config: DensifyConfig) -> Iterator[DenseView]:
     gaussians, poses = confirmed(run.state.map), run.poses
     views = (_densify(gaussians, to_se3(poses[row]), run.camera, config) for row in rows)
-    # Nobody looks at the rendering, so it is not fetched.
+    # The rendering is not used, so it is not fetched.
     return fetched(eqx.tree_at(lambda view: view.rendering, view, None) for view in views)
 
 
 def center_cloud(run: MappingRun) -> PointCloud:
-    """The confirmed Gaussians' means with their normals and colours."""
+    """Return the means of the confirmed Gaussians, with normals and colours."""
     gaussians = jax.device_get(confirmed(run.state.map))
     rows = (gaussians.means, gaussians.normals, gaussians.colors)
     return PointCloud(*(values[gaussians.valid].astype(np.float64) for values in rows))

@@ -1,4 +1,4 @@
-"""A finished run in the formats of other programs (COLMAP, nerfstudio, cameras as a mesh), and in another unit."""
+"""Export a finished run to the formats of other programs (COLMAP, nerfstudio, cameras as a mesh), or to metres."""
 
 import math
 from collections.abc import Sequence
@@ -26,7 +26,7 @@ POINTS_FILE = "points.ply"
 FORMATS = {"colmap": "colmap", "nerfstudio": "nerfstudio", "frustums": "cameras.ply"}  # and what is written
 IMAGE_FORMATS = {"colmap", "nerfstudio"}
 TRAJECTORIES, CLOUDS = ("trajectory.txt", "trajectory_online.txt"), ("map.ply", "points.ply", "mesh.ply")
-SHORTEST = 1e-6  # of the run's unit; a shorter distance between two cameras says nothing about a scale
+SHORTEST = 1e-6  # of the run's unit; a shorter distance between two cameras does not determine a scale
 
 
 @dataclass(frozen=True)
@@ -37,17 +37,17 @@ class ExportConfig:
     max_points: int = number(low=1, high=2**26)
     scale: float | None = number(low=1e-6, high=1e6)  # factor on all lengths; None = 1
     length: Sequence[float] | None = number(low=0, high=2**31)  # instead of it, see `factor_of`
-    # As in the run, or in the size on disk; either way without distortion.
+    # As in the run, or in the size on disk; undistorted either way.
     images: str = one_of("used", "original", default="used")
-    # What moves stays in the images, or there is a mask beside each, black where something moves.
+    # Moving things stay in the images, or each image has a mask that is black there.
     moving: str = one_of("kept", "masked", default="kept")
 
 
 def export(run: FinishedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
-    """Write a run into `folder`, which is there, in the run's unit; returns what was written.
+    """Write a run into an existing `folder`, in the run's unit; return what was written.
 
-    ValueError for an unknown format, one that needs images or points which are not there, or where something stands in
-    the place of an export; then nothing is written.
+    Raises ValueError, and writes nothing, for an unknown format, for one that lacks its images or points, or if the
+    place of an export is taken.
     """
     if unknown := [name for name in config.formats if name not in FORMATS]:
         raise ValueError(f"formats={unknown[0]} is not known: choose of {', '.join(FORMATS)}")
@@ -79,8 +79,8 @@ def find_factor(run: FinishedRun, config: ExportConfig) -> float | None:
 def _project(run: FinishedRun, folder: Path, dataset: ReadableFrames, config: ExportConfig, is_colmap: bool) -> None:
     """Write images/ and masks/ of the placed frames, and sparse/0/ of COLMAP or nerfstudio's transforms.json.
 
-    An image is undistorted and in the run's size. Its name is the frame's number and has one dot: 3DGS cuts at the
-    first one. A mask is black where something moves; for COLMAP its name is that of the image and .png.
+    An image is undistorted and in the run's size. Its name is the frame's number, with one dot, because 3DGS cuts names
+    at the first one. A mask is black where something moves; for COLMAP it is named like the image plus .png.
     """
     rows, size = np.flatnonzero(run.is_placed), (run.camera.width, run.camera.height)
     names, masks = [f"{run.frames[row]['index']:06d}.png" for row in rows], []
@@ -105,14 +105,14 @@ def _project(run: FinishedRun, folder: Path, dataset: ReadableFrames, config: Ex
 
 
 def _frustums(run: FinishedRun, path: Path) -> None:
-    """Write a pyramid for every frame in the colour of its status; the path is cut where the camera was lost."""
+    """Write a pyramid for every frame in the colour of its status; the path breaks where the camera was lost."""
     colors = np.array([rgb(STATUS_COLORS.get(frame["status"], OURS)) for frame in run.frames])
     is_joined = run.is_placed[1:] & run.is_placed[:-1]
     save_frustums(path, run.camera, run.poses, colors, is_joined, rgb(OURS))
 
 
 def _cloud(run: FinishedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
-    """Draw at most so many points (p, 3) with colours (p, 3), uint8, of the dense cloud; the same ones every time."""
+    """Sample at most `max_points` points (p, 3) and colours (p, 3), uint8, of the dense cloud; always the same ones."""
     columns = read_vertices(run.folder / POINTS_FILE)
     rows = np.sort(np.random.default_rng(0).permutation(len(columns["x"]))[:max_points])
     points = np.stack([columns[name][rows] for name in "xyz"], 1).astype(np.float64)
@@ -120,10 +120,10 @@ def _cloud(run: FinishedRun, max_points: int) -> tuple[np.ndarray, np.ndarray]:
 
 
 def factor_of(run: FinishedRun, length: Sequence[float]) -> float:
-    """Find the factor that makes the distance between two cameras as long as it is known to be.
+    """Compute the factor that gives the distance between two cameras its known length.
 
-    `length` are two frames, as `index` of frames.jsonl numbers them, and the metres between their camera centres; else,
-    or where a pose means nothing or both are at one place, ValueError.
+    `length` is two frames, numbered as `index` in frames.jsonl, and the metres between their camera centres. Raises
+    ValueError for anything else, for a lost frame, and for two cameras at one place.
     """
     if len(length) != 3 or not math.isfinite(length[2]) or length[2] <= 0 or any(n != int(n) for n in length[:2]):
         raise ValueError(f"length must be [frame,frame,metres], two numbers of frames and a length, got {[*length]}")
@@ -141,9 +141,9 @@ def factor_of(run: FinishedRun, length: Sequence[float]) -> float:
 
 
 def write_scaled(run: FinishedRun, folder: Path, factor: float) -> FinishedRun:
-    """Write trajectories, map.npz, clouds and scale.json into `folder`, which is there; returns the run in that unit.
+    """Write trajectories, map.npz, clouds and scale.json into an existing `folder`; return the run in that unit.
 
-    About the origin of the world, which stays. What the run does not have is left out; truth and features stay.
+    The origin of the world stays. Files that the run lacks are left out; truth and features stay.
     """
     unit = Sim3.about(np.zeros(3), factor)
     for name in TRAJECTORIES:

@@ -31,7 +31,7 @@ from emgs_jax.runs.back_end import loop_list, metric_graph
 from emgs_jax.runs.dense import DenseMap, center_cloud
 from emgs_jax.runs.finished_run import EXPORTS, FRAMES_FILE, LOOPS_FILE, POLISH, REPORT_FILE, TEXT_FILE
 
-# metrics.json first: it is what makes a folder a finished result.
+# metrics.json first: it makes a folder a finished result.
 OUTPUTS = (
     *("metrics.json", "trajectory.txt", "trajectory_online.txt", "graph.g2o", LOOPS_FILE, "frames.jsonl"),
     *("map.npz", "submaps", "places.npz", "map.ply", "points.ply", "mesh.ply", "overview.png", TEXT_FILE, REPORT_FILE),
@@ -42,9 +42,9 @@ OUTPUTS = (
 
 
 def claim_folder(folder: Path, goes_on: bool = False) -> list[str]:
-    """Make a folder that of a new run: outputs of an earlier one go to previous-1, previous-2, …; says what was done.
+    """Claim a folder for a new run: move outputs of an earlier one to previous-1, previous-2, …; say what was done.
 
-    So a run that ends early never lies beside the metrics of another one. What a run that `goes_on` has left stays.
+    So a run that ends early never lies beside the metrics of another one. Outputs of a run that `goes_on` stay.
     """
     notes = [f"removed {folder / name}, which a write that was killed has left" for name in remove_temporaries(folder)]
     old = [] if goes_on else [folder / name for name in OUTPUTS if (folder / name).exists()]
@@ -60,9 +60,9 @@ def claim_folder(folder: Path, goes_on: bool = False) -> list[str]:
 def save_progress(folder: Path, run: MappingRun) -> None:
     """Write trajectory.txt and map.npz of the frames so far; nothing before there is a map.
 
-    With a back end also places.npz, by which another run goes on in the map; trajectory_online.txt, the poses as they
-    were when the frames were placed (in the unit of the finished map), graph.g2o and loops.json. Frames that are left
-    out are marked in frames.jsonl; submaps that were never joined are in submaps/, by their numbers.
+    With a back end, also write places.npz, by which another run continues the map; trajectory_online.txt, the poses as
+    they were when the frames were placed (in the unit of the finished map); graph.g2o; and loops.json. Frames that are
+    apart are marked in frames.jsonl. Submaps that were never joined go to submaps/, by number.
     """
     _complete_lines(folder / FRAMES_FILE, run)
     if run.state is not None:
@@ -79,7 +79,7 @@ def save_progress(folder: Path, run: MappingRun) -> None:
         placed = [record.timestamp for record in run.records[-len(online) :]]
         save_trajectory_tum(folder / "trajectory_online.txt", placed, np.stack(online))
         write_json(folder / LOOPS_FILE, loop_list(end))
-        if end.factors:  # of a single frame nothing was measured
+        if end.factors:  # a single frame has no measurements
             save_graph_g2o(folder / "graph.g2o", metric_graph(end))
 
 
@@ -91,8 +91,7 @@ def _save_path_and_map(folder: Path, records: Sequence[FrameRecord], poses: Sequ
 def _complete_lines(path: Path, run: MappingRun) -> None:
     """Complete frames.jsonl at the end of a run.
 
-    The first frame's covariance is added, frames that are left out are marked, and what later frames have shown to have
-    moved in each is written.
+    Add the first frame's covariance, mark frames that are apart, and write what later frames have shown to move.
     """
     is_complete = all(record.reason != UNJOINED and record.moving_pixels is None for record in run.records)
     if not path.exists() or (run.first_covariance is None and is_complete):
@@ -118,7 +117,7 @@ def _complete_lines(path: Path, run: MappingRun) -> None:
 
 
 def save_classes(folder: Path, prior: Prior) -> None:
-    """Write text.npz, the classes that the map's features can be compared with; nothing where there are none."""
+    """Write text.npz, the embeddings of the classes; nothing without classes."""
     if prior.feature_names:
         about = prior.provenance.settings.get("features", {})  # of the model that made them, if there is one
         model, templates = about.get("model", {"prior": prior.provenance.name}), tuple(about.get("templates", ()))
@@ -136,11 +135,11 @@ def save_outputs(
     with_scale: bool,
     unit: str = "m",
 ) -> list[str]:
-    """Write the files that show the map; returns what could not be made, and why.
+    """Write the files that show the map; return what could not be made, and why.
 
     Args:
-        with_scale: the true path is drawn where it fits best by a similarity, not by a rigid motion, as it is scored.
-        unit: of the map's lengths, as the picture says it.
+        with_scale: align the true path by a similarity, as it is scored, not by a rigid motion.
+        unit: of the map's lengths, for the picture.
     """
     gaussians = jax.device_get(shown := confirmed(run.state.map))
     valid = gaussians.valid
@@ -166,10 +165,9 @@ def save_outputs(
 
 
 def _placed_truth(run: MappingRun, with_scale: bool) -> np.ndarray | None:
-    """The true path (n, 4, 4) where the estimate fits it best, NaN where unknown; None where it is nowhere known.
+    """Align the true path (n, 4, 4) with the estimate, NaN where unknown; None if it is unknown altogether.
 
-    A prior has a frame and often a unit of its own: drawn as it is, a path without error would look like one that
-    drifts.
+    A prior has its own frame and often its own unit, so without alignment an exact path would look as if it drifted.
     """
     known = with_truth(run, run.poses)
     if known is None:
@@ -180,7 +178,7 @@ def _placed_truth(run: MappingRun, with_scale: bool) -> np.ndarray | None:
 
 
 def _moved(run: MappingRun) -> tuple[np.ndarray | None, tuple[tuple[int, int], ...]]:
-    """The path before the back end moved it, and its loops, as `Paths` has them."""
+    """Return the path before the back end moved it, and its loops, for `Paths`."""
     end = run.back_end
     if end is None or not end.closures:  # frames that are only located in a saved map are no nodes beside its loops
         return None, ()

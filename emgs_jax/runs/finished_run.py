@@ -1,4 +1,4 @@
-"""A finished run as its folder tells it, for whoever shows it: checked once, read only."""
+"""A finished run, read from its folder and checked once, for everything that shows it."""
 
 import json
 from dataclasses import dataclass
@@ -29,18 +29,18 @@ SPLATS_FILE = "splats.ply"
 POLISH = (SPLATS_FILE, "polish.json", "polish.png", "polish.npz", "polish.txt")  # of `experiments.polish`
 EXPORTS = ("colmap", "nerfstudio", "cameras.ply", "scaled")  # what `experiments.export` writes beside them
 _PROVENANCE = {"protocol": (str, type(None)), "simulated": bool, "git": (dict, type(None))} | {
-    # What of `provenance.provenance` is read again, by dotted key.
+    # The parts of `provenance.provenance` that are read again, by dotted key.
     **dict.fromkeys(("prior", "data", "versions", "device", "config"), dict),
     **dict.fromkeys(("prior.settings", "config.densify", "config.densify.render"), dict),
     **dict.fromkeys(("prior.name", "data.name", "data.sequence", "versions.emgs_jax", "device.kind"), str),
 }
-_WORDS = ("_note", "/reason")  # how metrics end that are no numbers
+_WORDS = ("_note", "/reason")  # endings of metrics that are no numbers
 _OUTCOMES = ("accepted", "known", "unconfirmed", "unsolved", "refused")
 
 
 @dataclass(frozen=True)
 class FinishedRun:
-    """Outputs of a finished run, as read from its folder; poses are T_world_camera of `frames`, (n, 4, 4) float64."""
+    """Outputs of a finished run; poses are T_world_camera of `frames`, (n, 4, 4) float64."""
 
     folder: Path
     metrics: dict[str, Any]
@@ -62,22 +62,22 @@ class FinishedRun:
 
     @property
     def has_truth(self) -> np.ndarray:
-        """Of each frame, bool (n,)."""
+        """Whether each frame has a true pose, bool (n,)."""
         return np.isfinite(self.truth).all((1, 2))
 
     @property
     def is_placed(self) -> np.ndarray:
-        """Of each frame, bool (n,): its pose means something; a lost one's is a guess."""
+        """Whether each frame's pose is meaningful, bool (n,); a lost frame's is a guess."""
         return np.array([frame["status"] not in UNPLACED for frame in self.frames], bool)
 
     @property
     def is_metric(self) -> bool:
-        """Lengths of the map are meant to be metres."""
+        """Whether lengths of the map are meant to be metres."""
         return is_metric(self.provenance["prior"]["settings"])
 
 
 def read_run(folder: Path) -> FinishedRun:
-    """Read the folder of a finished run of this version; any other raises ValueError with the file and the remedy."""
+    """Read the folder of a finished run of this version; otherwise raise ValueError with the file and the remedy."""
     if not folder.is_dir():
         raise ValueError(f"{folder} is no folder: give the one that a run wrote, with metrics.json in it")
     needed = METRICS_FILE, FRAMES_FILE, "trajectory.txt", "map.npz"
@@ -109,7 +109,7 @@ def read_run(folder: Path) -> FinishedRun:
 
 
 def _check_metrics(path: Path, metrics: dict[str, Any]) -> None:
-    """Raise ValueError where a value is neither a number nor unknown, or what is said of the run lacks something."""
+    """Raise ValueError if a value is neither a number nor unknown, or what is said of the run lacks something."""
 
     def require(holds: bool, fault: str) -> None:
         if not holds:
@@ -153,7 +153,7 @@ def _online(path: Path, count: int) -> np.ndarray | None:
 
 
 def _camera(path: Path, metrics: dict[str, Any]) -> Camera:
-    """Return the camera of the frames, straight and in the size in use."""
+    """Return the camera of the frames, undistorted and in the size in use."""
     with sound(f"{path} does not say which camera it was: an older version wrote it"):
         known = metrics["provenance"]["data"]["frames"]
         fx, fy, cx, cy = (float(value) for value in known["intrinsics"])
@@ -173,7 +173,7 @@ def _loops(path: Path, count: int) -> list[dict[str, Any]]:
 
 
 def render_config(run: FinishedRun) -> RenderConfig:
-    """Read how the run drew its map; raises ValueError for settings of another version."""
+    """Read the run's settings of densification; raise ValueError for settings of another version."""
     settings = dict(run.provenance["config"]["densify"]["render"])
     settings.pop("_target_", None)
     with sound(f"{run.folder}/{METRICS_FILE} has settings of another version"):
@@ -191,10 +191,11 @@ class PlacedPaths(NamedTuple):
 
 
 def placed_paths(run: FinishedRun) -> PlacedPaths:
-    """Move the true path and the raw prior's to where they fit our path best; what is left of the difference.
+    """Align the true path and the raw prior's with ours, and return the remaining differences.
 
-    Each path is placed on the true one by itself, as for its error in metrics.json. Without truth the raw prior's path
-    stays where it is; that of a run in a saved map, which is in a world and unit of its own, is placed on ours.
+    Each path is aligned with the true one separately, as for its error in metrics.json. Without truth, the raw prior's
+    path stays where it is; in a run that continues a saved map it has its own world and unit, so it is aligned with
+    ours.
     """
     known, with_scale = run.has_truth, run.provenance["config"].get("evaluation", {}).get("alignment") == "sim3"
     back, raw, errors = None, run.raw, {}

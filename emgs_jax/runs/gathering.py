@@ -1,4 +1,4 @@
-"""Data gathered for comparison while a sequence is mapped: the raw predictions, and baselines."""
+"""Gather data for comparison while a sequence is mapped: raw predictions and baselines."""
 
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -29,7 +29,7 @@ class RawPrior:
     """Raw predictions of a sequence, without any mapping."""
 
     cloud: SpooledCloud  # its points at its poses; a voxel's side in its lengths is known once the poses are aligned
-    points: Spool  # in the camera's frame, of each frame (h, w, 3), in the prior's own lengths; 0 where it says nothing
+    points: Spool  # camera-frame points of each frame (h, w, 3), in the prior's own lengths; 0 for none
     classes: Spool | None = None  # of each frame's pixels (h, w), as positions in the prior's names, -1 = none
     labels: SpooledLabels | None = None  # its points, each with the class that its frame sees there
 
@@ -37,21 +37,21 @@ class RawPrior:
 class Baselines:
     """Every baseline twice: from the prior's views at the prior's own poses, and at ours.
 
-    At ours it takes what the map took: frames that are tracked or that the map was made from, of each the points with a
-    normal, in the size that the prediction was given there. So what is different is the fusion alone.
+    At our poses it uses what the map used: frames that are tracked or from which the map was made, their points with a
+    normal, at the scale that the map gave the prediction. So only the fusion differs.
 
-    Sizes in metres become lengths of the poses by the first view: a unit is what its true depths are of those that it
-    is fused with (median), so that the prior's own unit does not matter; 1 m where it shows no true depth.
+    The first view converts sizes in metres to lengths of the poses: the unit is the median ratio of its true depths to
+    its predicted ones, so that the prior's own unit does not matter; 1 m without true depth.
     """
 
     def __init__(self, configs: Mapping[str, BaselineConfig], observation: ObservationConfig, dataset: Dataset) -> None:
         self.raw: dict[str, Fusion] = {}
         self.ours: dict[str, Fusion] = {}
-        self.poses: list[np.ndarray] = []  # ours, as they were: the finished run has another unit
+        self.poses: list[np.ndarray] = []  # our poses at that time: the finished run has another unit
         self._configs, self._observation, self._dataset = configs, observation, dataset
 
     def add(self, record: FrameRecord, view: View, points: np.ndarray, mask: np.ndarray, raw_pose: np.ndarray) -> None:
-        """Add the frame of a record, with its points (h, w, 3), which are known, and its pose as the prior says it."""
+        """Add the frame of a record, with its points (h, w, 3), where they are known, and its raw pose."""
         row = len(self.poses)
         self.poses.append(record.pose)
         if not self._configs:
@@ -73,7 +73,7 @@ class Baselines:
 
 
 def unit_of(truth: np.ndarray, depth: np.ndarray) -> float:
-    """Return the metres of one length of a depth (h, w), by the median over pixels known in both; 1 without any."""
+    """Return the metres per unit of a depth (h, w), by the median over pixels known in both; 1 without any."""
     known = (truth > 0) & (depth > 0)
     return float(np.median(truth[known] / depth[known])) if known.any() else 1.0
 
@@ -85,12 +85,12 @@ def gather(
     baselines: Baselines | None = None,
     text: Text | None = None,
 ) -> RawPrior:
-    """Take all views of a sequence, one after the other: each in another thread, while the next frame is mapped.
+    """Take all views of a sequence, each in another thread while the next frame is mapped.
 
     Args:
         frames: records, which baselines need, and views of all frames.
-        keeps_points: the truth is known, or points are to lie at them.
-        text: names of the classes that pixels are labelled with, and their embeddings; None: no labels.
+        keeps_points: keep the raw points, because the truth is known or the cloud is made from them.
+        text: names and embeddings of the classes for labelling pixels; None: no labels.
     """
     cloud, kept, classes = SpooledCloud(), Spool(), Spool()
     labels = None if text is None else SpooledLabels(text[0])
@@ -114,7 +114,7 @@ def gather(
     with ThreadPoolExecutor(1, "raw prior") as thread:
         taken = thread.submit(int)
         for record, view in frames:
-            taken.result()  # one at a time: no more of them are in memory, and an error ends the mapping
+            taken.result()  # one at a time, to bound the memory; an error ends the mapping
             taken = thread.submit(take, record, view)
         taken.result()
     return RawPrior(cloud, kept, None if text is None else classes, labels)

@@ -1,8 +1,9 @@
-"""The images of finished runs, by the settings in their metrics.json."""
+"""The images of finished runs, from the settings in their metrics.json."""
 
 from collections.abc import Sequence
 from pathlib import Path
 
+from hydra.errors import InstantiationException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
@@ -14,14 +15,14 @@ from emgs_jax.runs.repeat import check_targets
 
 
 def images_of(run: FinishedRun) -> tuple[ReadableFrames | None, str]:
-    """The data set of a run, or why there is none; raises ValueError where settings name other code than ours."""
+    """Build the data set of a run, or return why there is none; ValueError if settings name code other than ours."""
     settings, count = run.provenance["config"], len(run.poses)
     check_targets(settings["dataset"])
     try:
         dataset = build_dataset(OmegaConf.create(dict(settings)))
-    except OmegaConfBaseException as error:  # a key of ours that the settings of older code do not have
+    except OmegaConfBaseException as error:  # a key that the settings of older code lack
         return None, f"The images are not shown: the run is of another version ({str(error).splitlines()[0]})."
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, InstantiationException) as error:
         return None, f"The images are not shown: {message_of(error)}"
     if len(dataset) != count:
         return None, f"The images are not shown: there are {len(dataset)} now, and {count} were mapped."
@@ -31,7 +32,7 @@ def images_of(run: FinishedRun) -> tuple[ReadableFrames | None, str]:
 
 
 class ImagesOfRuns(JoinedFrames):
-    """The images of the runs in some folders, one after the other; ValueError where those of a run are gone."""
+    """The images of the runs in some folders, one run after the other; ValueError if those of a run are gone."""
 
     def __init__(self, runs: Sequence[str], has_truth: bool = True) -> None:
         found = [images_of(read_run(Path(folder))) for folder in runs]

@@ -1,4 +1,4 @@
-"""Classes of points of the surface: the Gaussians that explain a point vote by their responsibilities."""
+"""Classify surface points: the Gaussians that explain a point vote by their responsibilities."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -17,13 +17,13 @@ from emgs_jax.prior.base import Prior
 from emgs_jax.semantics import classify, similarities
 
 NUM_NEIGHBOURS = 8  # Gaussians that may explain a point
-MAX_POINTS = 10_000  # at once; bounds the memory, does not change the result
+MAX_POINTS = 10_000  # at once, to bound the memory; does not change the result
 _classify, _similarities = eqx.filter_jit(classify), eqx.filter_jit(similarities)
 
 
 @dataclass(frozen=True)
 class LabelledMap:
-    """Gaussians with what they know of classes."""
+    """Gaussians with their evidence for classes."""
 
     means: np.ndarray  # (n, 3), m
     whiten: np.ndarray  # (n, 3, 3), inverse of the Cholesky factors of the covariances
@@ -35,32 +35,32 @@ class LabelledMap:
 
     @cached_property
     def labels(self) -> Int[np.ndarray, "n"]:
-        """The class of each Gaussian by itself, a position in `classes`."""
+        """The class of each Gaussian alone, a position in `classes`."""
         return self.evidence.argmax(1)
 
     @cached_property
     def nearest(self) -> NearestPoints:
-        """Search among the means."""
+        """Search tree of the means."""
         return NearestPoints(self.means)
 
     @property
     def centers(self) -> LabelledPoints:
-        """The means with their classes."""
+        """The means, with their classes."""
         return LabelledPoints(self.means, self.labels, self.classes)
 
     def classes_of(self, points: Float[np.ndarray, "m 3"]) -> Int[np.ndarray, "m"]:
-        """The class with most evidence at each point: argmax_c Σ_k r_k e_kc; -1 without Gaussians.
+        """Find the class with most evidence at each point: argmax_c Σ_k r_k e_kc; -1 without Gaussians.
 
-        r_k is the responsibility (eq. 3, by place alone) of one of the nearest Gaussians by their means, as in the
-        E-step. A wall's Gaussian whose mean is near to a cup does not explain the cup, because it is flat; and one that
-        was seen once does not outvote its neighbours, which were seen from all sides.
+        r_k is the responsibility (eq. 3, by position alone) of one of the Gaussians with the nearest means, as in the
+        E-step. A flat Gaussian of a wall does not explain a cup near its mean, and one that was seen once does not
+        outvote its neighbours that were seen from all sides.
         """
         if not len(self.means):
             return np.full(len(points), -1)
         rows = self.nearest.query(points, NUM_NEIGHBOURS)[1]
         votes = self.labels[rows]
         classes = votes[:, 0].copy()
-        # Where all neighbours have one class it is that one; the others are few, and the memory for them is bounded.
+        # If all neighbours share a class, take it; the other points are few, so their memory is bounded.
         is_open = np.flatnonzero((votes != votes[:, :1]).any(1))
         for part in np.array_split(is_open, -(-len(is_open) // MAX_POINTS)) if len(is_open) else ():
             classes[part] = self._elected(points[part], rows[part])
@@ -74,7 +74,7 @@ class LabelledMap:
 
 
 def labelled_map(run: MappingRun, prior: Prior) -> LabelledMap | None:
-    """The confirmed Gaussians that have a feature, with its projection on each class's text; None without classes."""
+    """Project the features of confirmed Gaussians on each class's text; None without classes."""
     gaussians = confirmed(run.state.map)
     if not prior.feature_names or not gaussians.features.shape[-1]:
         return None

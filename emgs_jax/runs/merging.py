@@ -1,4 +1,4 @@
-"""Finished runs become one: their folders are read, their maps joined, and the files of one run are written."""
+"""Merge finished runs: read their folders, join their maps, and write the files of one run."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
@@ -30,12 +30,12 @@ from emgs_jax.runs.provenance import git_now, write_metrics
 from emgs_jax.runs.repeat import repeat
 from emgs_jax.runs.results import METRICS_FILE
 
-OF_DATA = "name", "sequence"  # of a provenance's data
+OF_DATA = "name", "sequence"  # keys of a provenance's data
 
 
 @dataclass(frozen=True)
 class MergeableRun:
-    """A finished run as it is merged: with a node for each of its records."""
+    """A finished run to be merged, with a node for each of its records."""
 
     finished: FinishedRun
     atlas: Atlas
@@ -43,7 +43,7 @@ class MergeableRun:
 
 
 def mergeable(folder: Path) -> MergeableRun:
-    """Read a finished run; raises ValueError where it has no keyframes by which its places are found."""
+    """Read a finished run; raise ValueError if it has no keyframes for place recognition."""
     run = read_run(folder)
     config = config_of(run)
     slam, graph = build(config, "slam"), graph_config(config)
@@ -60,12 +60,12 @@ def mergeable(folder: Path) -> MergeableRun:
 
 
 def config_of(run: FinishedRun) -> DictConfig:
-    """The config of a run, with infinities, which metrics.json has not."""
+    """Return the config of a run, with infinities, which metrics.json cannot hold."""
     return compose(*repeat(run.provenance["config"]).words)
 
 
 def record_of(line: Mapping[str, Any], pose: np.ndarray) -> FrameRecord:
-    """Read a record from its line of frames.jsonl; `pose` is that of the finished run."""
+    """Read a record from its line of frames.jsonl; `pose` is the final one."""
 
     known = {field.name: line[field.name] for field in fields(FrameRecord) if field.name in line}
     for name, value in known.items():
@@ -75,7 +75,7 @@ def record_of(line: Mapping[str, Any], pose: np.ndarray) -> FrameRecord:
 
 
 def with_records(end: BackEnd, records: Sequence[FrameRecord], online: np.ndarray) -> tuple[BackEnd, Sequence[Node]]:
-    """Give the nodes what the records know; and make nodes of frames before the map began, which have none.
+    """Add the records' data to the nodes, and make nodes for frames before the map began.
 
     Args:
         online: poses as first estimated, nan before the map began.
@@ -93,12 +93,32 @@ def with_records(end: BackEnd, records: Sequence[FrameRecord], online: np.ndarra
     return replace(end, nodes=(*end.nodes[:first], *known), first_node=first), lost
 
 
-def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, list[int], dict[int, str]]:
-    """Join all runs with the first one, each where it shows places of it or of one that is joined already.
+def check_features(first: FinishedRun, other: FinishedRun) -> None:
+    """ValueError where the features of two runs are of other models, or mean other classes."""
+    one, two = first.text, other.text
+    if one is None or two is None:
+        return
+    is_one_space = one.model == two.model and one.vectors.shape[1] == two.vectors.shape[1]
+    if is_one_space:
+        is_same_name = np.array([[a == b for b in two.names] for a in one.names])
+        is_same_vector = (one.vectors[:, None] == two.vectors).all(-1)
+        is_one_space = (is_same_name == is_same_vector).all()
+    if not is_one_space:
+        raise ValueError(
+            f"features of {other.folder} ({', '.join(two.names[:3])}, …) are not those of {first.folder} "
+            f"({', '.join(one.names[:3])}, …): map both with the same features= and the same classes"
+        )
 
-    Returns the run of all, the order in which their frames are in it, and why a run of these was not joined. Without
-    `has_truth` the true poses are not in one world, and left out. ValueError where none can be joined with the first.
+
+def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, list[int], dict[int, str]]:
+    """Join all runs with the first one, each by common places with a run that is already joined.
+
+    Returns the run of all, the order of their frames in it, and why a run was not joined. Without `has_truth` the true
+    poses are not in one world, and are left out. ValueError if none can be joined with the first,
+    or if features mean something else.
     """
+    for other in runs[1:]:
+        check_features(runs[0].finished, other.finished)
     atlas, order, pending, reasons = runs[0].atlas, [0], [*range(1, len(runs))], {}
     while pending:
         for number in pending:
@@ -126,9 +146,9 @@ def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, l
 
 
 def in_one_world(records: Sequence[FrameRecord], parts: Sequence[MergeableRun], atlas: Atlas) -> list[FrameRecord]:
-    """Write what the records say of other poses and nodes in the world and the numbers of the merged run.
+    """Convert the other poses and node numbers in the records to the world and numbers of the merged run.
 
-    The first frame of each run that is in its map was placed where the raw prior says, so both move alike.
+    The first mapped frame of each run was placed at its raw pose, so raw poses move in the same way.
     """
     found, nodes = [], atlas.graph.nodes[atlas.graph.first_node :]
     for part in parts:
@@ -143,7 +163,7 @@ def in_one_world(records: Sequence[FrameRecord], parts: Sequence[MergeableRun], 
 
 
 def numbered(atlas: Atlas) -> Atlas:
-    """Give the nodes of all records the numbers of the frames of the merged run."""
+    """Renumber the nodes of all records by the frames of the merged run."""
     first = atlas.graph.first_node
     nodes = tuple(
         replace(node, frame=row - first) if row >= first else node for row, node in enumerate(atlas.graph.nodes)
@@ -154,7 +174,7 @@ def numbered(atlas: Atlas) -> Atlas:
 def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[dict[str, Any], list[str]]:
     """Write a merged run into a new folder, with unit and world of the first run.
 
-    Returns its metrics; and what there is to say: which run was not joined and why, and what could not be made.
+    Returns its metrics, and notes: which run was not joined and why, and what could not be made.
     """
     read = [mergeable(folder) for folder in folders]
     run, order, reasons = merged(read, has_truth)
@@ -186,7 +206,7 @@ def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[d
 
 
 def _origin(parts: Sequence[FinishedRun], has_truth: bool) -> tuple[dict[str, Any], ReadableFrames | None, str]:
-    """Provenance of a merged run, its images, and why there are none."""
+    """Make the provenance of a merged run, its images, and the reason if there are none."""
     first = parts[0].provenance
     settings = OmegaConf.to_container(OmegaConf.create(dict(first["config"])), resolve=True)
     images = {"_target_": OmegaConf.load(CONF / "merge.yaml").dataset["_target_"], "has_truth": has_truth}
@@ -206,6 +226,6 @@ def _origin(parts: Sequence[FinishedRun], has_truth: bool) -> tuple[dict[str, An
 
 
 def _camera_of(run: FinishedRun) -> tuple[tuple[int, int], tuple[float, float, float, float]]:
-    """Size and intrinsics of a run's images, to the last digit."""
+    """Return size and intrinsics of a run's images, exactly."""
     known = run.provenance["data"]["frames"]
     return tuple(known["size"]), tuple(known["intrinsics"])

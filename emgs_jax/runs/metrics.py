@@ -1,4 +1,4 @@
-"""metrics.json of a run: the map against the truth, the prior alone against the truth, counts and times."""
+"""metrics.json of a run: map and raw prior against the truth, counts and times."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -49,7 +49,7 @@ STATUSES = ("tracked", "degraded", "lost", APART, "initialization")
 
 @dataclass(frozen=True)
 class Scorer:
-    """References that all maps of one data set are compared with, made once."""
+    """References for all maps of one data set, made once."""
 
     dataset: ReadableFrames
     evaluation: EvaluationConfig
@@ -59,12 +59,12 @@ class Scorer:
 
     @property
     def is_metric(self) -> bool:
-        """The prior predicts in metres, as far as it says."""
+        """Whether the prior states that it predicts in metres."""
         return self.prior is None or is_metric(self.prior.provenance.settings)
 
 
 def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior) -> Scorer:
-    """Read the truth of a data set, each frame once."""
+    """Read the truth of a data set, reading each frame once."""
     labels = None
     if compared_text(dataset, prior) is not None:
         labels = TrueLabels(dataset, evaluation.voxel_m, evaluation.max_depth_m)
@@ -73,12 +73,12 @@ def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Pri
 
 
 def compared_text(dataset: ReadableFrames, prior: Prior) -> Text | None:
-    """The prior's classes where the data set has true ones to compare them with."""
+    """Return the prior's classes, if the data set has true ones to compare them with."""
     return (tuple(prior.feature_names), prior.text_features) if dataset.classes and prior.feature_names else None
 
 
 def true_cloud(dataset: ReadableFrames, config: EvaluationConfig, labels: TrueLabels | None = None) -> Reference:
-    """The true points of the frames whose pose is known; `labels` take each frame on the way."""
+    """Collect the true points of the frames with a known pose; `labels` gets each frame, too."""
 
     def frames() -> Iterator[Frame]:
         for row in range(len(dataset) if dataset.has_ground_truth else 0):
@@ -93,11 +93,11 @@ def true_cloud(dataset: ReadableFrames, config: EvaluationConfig, labels: TrueLa
 def score_map(
     run: MappingRun, dense: PointCloud, centers: PointCloud, labels: LabelledPoints | None, scorer: Scorer
 ) -> Metrics:
-    """Trajectory, reconstruction and segmentation metrics of the map; empty without any true pose.
+    """Compute trajectory, reconstruction and segmentation metrics of the map; empty without any true pose.
 
-    The dense map is compared as the protocol says, under the other alignment as `reconstruction_<alignment>/…`,
-    placed by its points as `reconstruction_icp/…`, and the plain centres as `reconstruction_centers/…`. Without scale
-    it is not compared where the prior's unit is not the metre: the distances would say no more than that.
+    The dense map is compared as the protocol says; under the other alignment as `reconstruction_<alignment>/…`; aligned
+    by ICP as `reconstruction_icp/…`; and the centres alone as `reconstruction_centers/…`. If the prior's unit is not
+    the metre, there is no comparison without scale: the distances would only reflect the unit.
     """
     poses, truth, config = with_truth(run, run.poses), scorer.truth, scorer.evaluation
     if poses is None:
@@ -114,10 +114,10 @@ def score_map(
 
 
 def score_cloud(cloud: PointCloud | SpooledCloud, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer) -> Metrics:
-    """Reconstruction metrics of a cloud as the protocol says, and placed by its points as `reconstruction_icp/…`.
+    """Compute reconstruction metrics of a cloud as the protocol says, and aligned by ICP as `reconstruction_icp/…`.
 
-    The second placement begins with the first and moves the cloud rigidly onto the truth (ICP): an almost straight path
-    leaves the rotation about itself open, and then the first one says more about that than about the cloud.
+    ICP starts from the protocol's alignment and moves the cloud rigidly. An almost straight path does not determine the
+    rotation about itself, and then the first alignment measures that more than the cloud.
     """
     config = scorer.evaluation
     distances = config.icp_distance_m, config.placement_icp_m
@@ -126,9 +126,9 @@ def score_cloud(cloud: PointCloud | SpooledCloud, poses: tuple[np.ndarray, np.nd
 
 
 def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
-    """Trajectory, reconstruction, rendering and segmentation metrics of the raw prior.
+    """Compute trajectory, reconstruction, rendering and segmentation metrics of the raw prior.
 
-    Its rendering is what it says of each frame; its segmentation is that of its points with the classes that most
+    Its rendering is its own prediction of each frame; its segmentation is that of its points, with the class that most
     frames see there.
     """
     poses = with_truth(run, run.raw_poses)
@@ -147,7 +147,7 @@ def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
 def _score_labels(
     labels: LabelledPoints | SpooledLabels | None, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer
 ) -> Metrics:
-    """Segmentation metrics of points with classes, aligned like the cloud; empty without classes."""
+    """Compute segmentation metrics of points with classes, aligned like the cloud; empty without classes."""
     if labels is None or scorer.labels is None:
         return {}
     aligned = align_labels(labels, scorer.truth, poses, scorer.evaluation)
@@ -155,9 +155,9 @@ def _score_labels(
 
 
 def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer: Scorer) -> Metrics:
-    """Reconstruction and rendering metrics of every baseline, aligned by the poses that it was built at.
+    """Compute reconstruction and rendering metrics of every baseline, aligned by the poses at which it was built.
 
-    Rendered is each frame whose pose is known: at our poses those that are not lost, at the prior's those with points.
+    Every frame with a known pose is rendered: at our poses those that are not lost, at the prior's those with points.
     """
     is_known = {
         "raw": [raw.points[row].any() for row in range(len(raw.points))],
@@ -181,7 +181,7 @@ def score_baselines(run: MappingRun, baselines: Baselines, raw: RawPrior, scorer
 
 
 def describe(run: MappingRun, dataset: ReadableFrames | None = None) -> Metrics:
-    """Size of the map, how many frames came to what, time and memory; without a data set none was left out."""
+    """Count Gaussians and frames by outcome, and measure time and memory; without a data set no frame was skipped."""
     statuses = Counter(record.status for record in run.records)
     gaussians = jax.device_get(confirmed(run.state.map))
     metrics: Metrics = {"map/num_gaussians": int(gaussians.valid.sum())}
@@ -190,7 +190,7 @@ def describe(run: MappingRun, dataset: ReadableFrames | None = None) -> Metrics:
     metrics["map/capacity"] = run.config.submap.map_capacity
     metrics |= {f"frames/{status}": statuses[status] for status in STATUSES}
     metrics["frames/skipped"] = 0 if dataset is None else len(dataset.skipped)
-    for number in run.apart:  # its frames, and the error of its path in its own unit
+    for number in run.apart:  # number of frames, and error of the path in its own unit
         records = records_apart(run.records, number)
         known = [(record.pose, record.true_pose) for record in records if record.true_pose is not None]
         metrics[f"submaps/{number}/frames"] = len(records)
@@ -208,7 +208,7 @@ def describe(run: MappingRun, dataset: ReadableFrames | None = None) -> Metrics:
 
 
 def _double_walls(gaussians: Gaussians, run: MappingRun) -> float | None:
-    """Per cent of valid Gaussians on the host that another stands behind; a metre is what the true path says."""
+    """Compute the percentage of valid Gaussians with another one behind; the true path defines the metre."""
     poses = with_truth(run, run.poses)
     metre = None if poses is None else 1.0 / align_poses(*poses, with_scale=True)[0].scale
     rows = (values[gaussians.valid] for values in (gaussians.means, gaussians.normals, gaussians.covs))
@@ -232,7 +232,7 @@ def score_back_end(run: MappingRun) -> Metrics:
 
 
 def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.ndarray | None]]:
-    """The loops that are believed in metres of the truth, and the true poses of the nodes that they are between."""
+    """Return accepted and known loops in metres of the truth, with the true poses of their nodes."""
     end = run.back_end
     compared = with_truth(run, run.poses)
     unit = (None if compared is None else trajectory_metrics(*compared)["trajectory/scale"]) or 1.0
@@ -245,14 +245,14 @@ def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.
 
 
 def spent(clock: Clock) -> Metrics:
-    """Seconds of each phase, compilation included; of compilation in all phases; peak memory."""
+    """Return seconds of each phase, including compilation; of compilation in all phases; and peak memory."""
     metrics: Metrics = {f"time/{name}_seconds": seconds for name, seconds in clock.phases.items()}
     metrics |= {"time/compile_seconds": clock.compile_seconds, "time/total_seconds": clock.total_seconds}
     return metrics | {"memory/peak_mb": peak_memory_mb()}
 
 
 def seconds_per_frame(records: list[FrameRecord]) -> float | None:
-    """Mean over the steps in which nothing was compiled; if there is none, over all without their compilation."""
+    """Average over the steps without compilation; without any such step, over all, minus their compilation."""
     steps = [record for record in records if record.status != "initialization"] or records
     steady = [record.seconds for record in steps if record.compile_seconds == 0]
     return float(np.mean(steady or [record.seconds - record.compile_seconds for record in steps])) if steps else None

@@ -1,4 +1,4 @@
-"""What was taken for moving: over images, and as masks for other programs."""
+"""Moving pixels: drawn over images, and as masks for other programs."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -10,12 +10,12 @@ from emgs_jax.data.reading import resize_nearest
 from emgs_jax.io.run_lengths import from_run_lengths
 from emgs_jax.runs.results import sound
 
-MUCH = 0.03  # share of pixels; less may be wrong predictions
+MUCH = 0.03  # share of pixels; a smaller one may be wrong predictions
 _TINT, _OPACITY = np.array([0, 230, 0]), 0.6
 
 
 def moving_mask(line: Mapping[str, Any], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
-    """What moves in the frame of a line of frames.jsonl, in an image of (width, height); ValueError without a mask."""
+    """Return the moving pixels of a line of frames.jsonl in an image of (width, height); ValueError without a mask."""
     if not line.get("moving_pixels"):
         return np.zeros(size[::-1], bool)
     with sound(f"moving_pixels of frame {line.get('index')} in frames.jsonl is no mask"):
@@ -24,14 +24,14 @@ def moving_mask(line: Mapping[str, Any], size: tuple[int, int]) -> Bool[np.ndarr
 
 
 def with_moving(image: UInt8[np.ndarray, "h w 3"], line: Mapping[str, Any]) -> UInt8[np.ndarray, "h w 3"]:
-    """The image of a frame, green where something moves."""
+    """Colour an image green where something moves."""
     is_moving = moving_mask(line, image.shape[1::-1])[..., None]
     tinted = (1.0 - _OPACITY) * image + _OPACITY * _TINT
     return np.where(is_moving, tinted, image).astype(np.uint8)
 
 
 def frame_facts(line: Mapping[str, Any]) -> str:
-    """Say the numbers of a frame in one line."""
+    """Describe a frame in one line of numbers."""
     known = {
         "inliers": lambda v: f"{v:,} inliers",
         "residual": lambda v: f"residual {100 * v:.1f} % of the depth",

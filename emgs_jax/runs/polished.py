@@ -1,4 +1,4 @@
-"""A finished run polished: its frames and map in, splats.ply, polish.json and pictures of held-out frames out."""
+"""Polish a finished run: from its frames and map to splats.ply, polish.json and pictures of held-out frames."""
 
 from collections.abc import Callable
 from functools import partial
@@ -46,14 +46,14 @@ _ssim, _gain = jax.jit(ssim), jax.jit(relative_gain)
 def polish(
     run: FinishedRun, dataset: ReadableFrames, config: PolishConfig, densify_config: DensifyConfig
 ) -> dict[str, Any]:
-    """Fit splats to all placed frames but the held-out ones; write them, and how the held-out ones look before, after.
+    """Fit splats to all placed frames but the held-out ones; write them, and pictures of the held-out ones.
 
-    Returns what polish.json says. ValueError where the map is empty, there is no frame to fit or to compare with, or
-    optax is not installed.
+    Returns the contents of polish.json. Raises ValueError if the map is empty, if there is no frame to fit or to
+    compare with, or if optax is not installed.
 
     Args:
-        run: whose folder is written into.
-        densify_config: how the run drew its map.
+        run: finished run; the files go into its folder.
+        densify_config: the run's settings of densification.
     """
     extra(*OPTAX)
     gaussians = confirmed(run.map)
@@ -70,7 +70,7 @@ def polish(
         image = frame.image / np.float32(255)
         is_out = moving_mask(run.frames[row], image.shape[1::-1])
         is_out = is_out if frame.mask is None else is_out | frame.mask
-        if is_out.any():  # what is left out is as the map has it, and holds no splat
+        if is_out.any():  # masked pixels keep the map's colours and get no splat
             image = np.where(is_out[..., None], view.colors, image)
             view = eqx.tree_at(lambda v: v.valid, view, view.valid & ~is_out)
         return image, view
@@ -82,7 +82,7 @@ def polish(
         seeds.add(view, image, run.poses[row])
         targets.append(target_of(image, view))
         gains.append(np.asarray(_gain(view.colors, image, view.valid)) ** config.exposures)
-    for row in held:  # what only these see is as the map has it: their images stay out
+    for row in held:  # surface that only these see keeps the map's colours: their images stay out
         view = seen(row)[1]
         seeds.add(view, view.colors, run.poses[row])
     anchors, colors = seeds.anchors(_map_noise(gaussians, nearest))
@@ -109,7 +109,7 @@ def polish(
 def _fitted(
     anchors: Anchors, colors: np.ndarray, views: Views, run: FinishedRun, config: PolishConfig
 ) -> tuple[Appearance, Views]:
-    """`fit` with a progress bar."""
+    """Run `fit` with a progress bar."""
     with tqdm(total=config.steps, desc="polishing", unit="step") as bar:
         recent: list[float] = []
 
@@ -122,12 +122,12 @@ def _fitted(
 
 
 def _between(gains: np.ndarray, rows: list[int], count: int) -> np.ndarray:
-    """Gains of all frames (count, 3): those of others than `rows` lie between those of the two beside them."""
+    """Interpolate the gains of all frames (count, 3) from those of `rows`."""
     return np.stack([np.interp(np.arange(count), rows, channel) for channel in gains.T], axis=1)
 
 
 def _save_splats(run: FinishedRun, splats: Gaussians, opacity: jax.Array, nearest: Nearest) -> int:
-    """Write splats.ply, with the class of the nearest Gaussian where the map has classes; returns how many."""
+    """Write splats.ply, with the class of the nearest Gaussian if the map has classes; return the number of splats."""
     gaussians, labels, classes = confirmed(run.map), None, ()
     if run.text is not None and gaussians.features.shape[-1]:
         text, classes = on_device(np.asarray(run.text.vectors, np.float32)), run.text.names
@@ -137,15 +137,16 @@ def _save_splats(run: FinishedRun, splats: Gaussians, opacity: jax.Array, neares
 
 
 def target_of(image: np.ndarray, view: DenseView) -> np.ndarray:
-    """Target of `loss`, (h, w, 4), in half floats; a depth beyond these counts as none."""
+    """Make the target of `loss`, (h, w, 4), in half floats; a depth beyond their range counts as none."""
     has_depth = view.valid & (view.depth < np.finfo(np.float16).max)
     return np.concatenate([image, np.where(has_depth, view.depth, 0.0)[..., None]], axis=-1).astype(np.float16)
 
 
 def _spreads(run: FinishedRun, rows: list[int], config: PolishConfig) -> np.ndarray:
-    """Square roots of the covariances of frames (m, 6, 6); 0 where poses stay.
+    """Compute square roots of the frames' covariances (m, 6, 6); 0 if poses are fixed.
 
-    A frame without one, as the first, to which the others' are relative, has that of the nearest frame with one.
+    A frame without a covariance, such as the first, to which the others are relative, takes that of the nearest frame
+    with one.
     """
     spreads = np.zeros((len(rows), 6, 6))
     known = np.array([row for row, line in enumerate(run.frames) if line.get("covariance") is not None])
@@ -157,14 +158,14 @@ def _spreads(run: FinishedRun, rows: list[int], config: PolishConfig) -> np.ndar
 
 
 def _nearest(gaussians: Gaussians) -> Nearest:
-    """A function from points (n, 3) to rows of the Gaussians with the nearest means."""
+    """Make a function from points (n, 3) to rows of the Gaussians with the nearest means."""
     rows = np.flatnonzero(np.asarray(gaussians.valid))
     means = np.asarray(gaussians.means)[rows]
     return lambda points: rows[owners(points, means)]
 
 
 def _map_noise(gaussians: Gaussians, nearest: Nearest) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """The standard deviation along the normal (m) of the Gaussian that is nearest to each point."""
+    """Look up the standard deviation along the normal (m) of each point's nearest Gaussian."""
     covs = np.asarray(gaussians.covs)
 
     def noise(means: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -179,7 +180,7 @@ def _drawn(splats: Gaussians, opacity: jax.Array, T: jaxlie.SE3, camera: Camera,
 
 
 def _picture(*arguments: Any) -> tuple[Rendering, int]:
-    """The splats on the host, and how many had no room."""
+    """Render the splats to the host, and count those that did not fit."""
     drawn = jax.device_get(_drawn(*arguments))
     return drawn, int(drawn.overflow)
 
@@ -187,10 +188,10 @@ def _picture(*arguments: Any) -> tuple[Rendering, int]:
 def _compare(
     run: FinishedRun, dataset: ReadableFrames, held: list[int], seen: Callable[[int], Seen], drawn: tuple
 ) -> dict[str, Any]:
-    """PSNR and SSIM over the pixels that the map covers, depth errors and ATE where the truth is known.
+    """Compute PSNR and SSIM over pixels that the map covers, and depth errors and ATE where the truth is known.
 
-    Before is the map at the run's poses, after are the splats at theirs. Where the map covers nothing both pictures are
-    the image itself in SSIM, and do not count in PSNR. No pixel of a held-out frame says how bright it is.
+    *Before* is the map at the run's poses, *after* the splats at theirs. Where the map covers nothing, both pictures
+    equal the image in SSIM and do not count in PSNR. No pixel of a held-out frame is used to estimate its brightness.
     """
     splats, opacity, poses, gains, terms = drawn
     known = run.has_truth & run.is_placed

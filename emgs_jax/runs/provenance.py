@@ -15,9 +15,9 @@ from emgs_jax.data.base import Dataset
 from emgs_jax.io.files import flat, write_json
 from emgs_jax.prior.base import Provenance
 
-RESULT_FORMAT = 1  # of metrics.json; another one is refused where results are read
-OWN_UNITS = ("colmap", "nerfstudio")  # data sets whose true poses are in a unit of their own
-RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the prior without any mapping
+RESULT_FORMAT = 1  # of metrics.json; results of another format are refused
+OWN_UNITS = ("colmap", "nerfstudio")  # data sets whose true poses have their own unit
+RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the raw prior
 ROWS = {  # prefix of the metrics of an estimate -> what it is
     "": "ours",
     RAW_PRIOR: "raw prior",
@@ -35,7 +35,7 @@ _PACKAGES = {name: (name,) for name in ("jax", "jaxlib", "numpy", "optimistix", 
 
 
 def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -> dict[str, Any]:
-    """Say where a result comes from: the block that stands in every result file."""
+    """Describe the origin of a result: the block in every result file."""
     device = jax.devices()[0]
     return {
         "format": RESULT_FORMAT,
@@ -65,17 +65,17 @@ def signature(block: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def git_now() -> dict[str, Any] | None:
-    """The `git_revision` of this code."""
+    """Return the `git_revision` of this code."""
     return git_revision(Path(__file__).resolve().parents[2])
 
 
 def code_of(block: Mapping[str, Any]) -> tuple[dict[str, Any] | None, str | None]:
-    """The commit and the version that a provenance names; changes since a commit are not seen."""
+    """Return commit and version of a provenance; uncommitted changes do not show."""
     return block["git"], block.get("versions", {}).get("emgs_jax")
 
 
 def code_now() -> tuple[dict[str, Any] | None, str | None]:
-    """`code_of` a provenance of this code."""
+    """Return `code_of` for this code."""
     return git_now(), _version(_PACKAGES["emgs_jax"])
 
 
@@ -96,13 +96,13 @@ def prefixed(metrics: Mapping[str, Any], prefix: str) -> dict[str, Any]:
 
 
 def write_metrics(path: str | os.PathLike, metrics: Mapping[str, Any]) -> None:
-    """Write metrics.json: ours, the raw prior's, the baselines', everything else; NaN and infinities become null."""
+    """Write metrics.json in order: ours, the raw prior's, baselines', the rest; NaN and infinities become null."""
     write_json(path, {key: metrics[key] for key in sorted(metrics, key=_rank)})
 
 
 def is_metric(settings: Mapping[str, Any]) -> bool:
     """Test whether a prior with these settings predicts in metres."""
-    said = flat(settings)  # of what a recording was made with, too
+    said = flat(settings)  # including the settings that made a recording
     has_unit = not any(key.endswith("median_depth") for key in said)
     return has_unit and all(value != "arbitrary" for key, value in said.items() if key.endswith("scale"))
 
@@ -113,7 +113,7 @@ def has_metric_truth(block: Mapping[str, Any]) -> bool:
 
 
 def length_words(length: float, block: Mapping[str, Any]) -> str:
-    """A length of the truth in centimetres, or in units of its own."""
+    """Write a length of the truth in centimetres, or in units of its own."""
     return f"{100 * length:.1f} cm" if has_metric_truth(block) else f"{length:.3g} units of the reference"
 
 
@@ -129,7 +129,7 @@ def _rank(key: str) -> tuple[int, int]:
 
 
 def _version(names: tuple[str, ...]) -> str | None:
-    """The version of the first of these packages that is installed."""
+    """Return the version of the first of these packages that is installed."""
     for name in names:
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             return importlib.metadata.version(name)

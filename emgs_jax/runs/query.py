@@ -1,4 +1,4 @@
-"""Words to a finished map: which Gaussians answer, which objects they are, and the files that say so.
+"""Query a finished map for words: the Gaussians that answer, their objects, and the files with both.
 
 `semantic.npz`, format `emgs_jax.semantic` version 1, is an npz without pickled objects. Of each confirmed Gaussian, in
 the order of the map: `rows` (n,) int32, where it stands in map.npz; `means` (n, 3) float32; `features` (n, f) float16,
@@ -31,7 +31,7 @@ from emgs_jax.semantics import Relevance, relevance
 
 QUERY_FILE, SEMANTIC_FILE, SEMANTIC_PLY = "query.json", "semantic.npz", "semantic.ply"
 FORMAT, SEMANTIC_FORMAT, VERSION = "emgs_jax.query", "emgs_jax.semantic", 1
-GREY = 0.75  # of what has no feature
+GREY = 0.75  # of a Gaussian without a feature
 _relevance = eqx.filter_jit(relevance)
 
 
@@ -40,7 +40,7 @@ class Question:
     """Query to a map."""
 
     words: TextEmbeddings
-    against: TextEmbeddings  # rivals, which are not asked for, in the same space; may be empty
+    against: TextEmbeddings  # rivals, which are not searched for, in the same space; may be empty
     margin: float
     min_cosine: float
     instances: InstanceConfig
@@ -59,7 +59,7 @@ class Answer:
 
 
 def ask(run: FinishedRun, question: Question) -> Answer:
-    """Ask the map of a run."""
+    """Query the map of a run."""
     gaussians = confirmed(run.map)
     vectors = (jnp.asarray(text.vectors, jnp.float32) for text in (question.words, question.against))
     limits = (jnp.asarray(value, jnp.float32) for value in (question.margin, question.min_cosine))
@@ -75,7 +75,7 @@ def ask(run: FinishedRun, question: Question) -> Answer:
 
 
 def write_answer(folder: Path, source: Path, answer: Answer) -> dict[str, Any]:
-    """Write query.json, semantic.npz and semantic.ply into `folder`; returns what query.json says.
+    """Write query.json, semantic.npz and semantic.ply into `folder`; return the contents of query.json.
 
     `source` is the folder of the run.
     """
@@ -136,13 +136,13 @@ def heat(answer: Answer, word: int) -> np.ndarray:
 
 
 def painted(answer: Answer) -> np.ndarray:
-    """Colour all Gaussians (n, 3): the relevance of a single word, else the class; grey where there is none."""
+    """Colour all Gaussians (n, 3) by the relevance of a single word, or by class; grey without either."""
     count, labels = len(answer.question.words.names), answer.relevance.labels
     return hot(heat(answer, 0)) if count == 1 else np.where(labels[:, None] >= 0, class_colors(count)[labels], GREY)
 
 
 def hot(values: np.ndarray) -> np.ndarray:
-    """Colour numbers in [0, 1], (…, 3); grey where they are nan."""
+    """Colour numbers in [0, 1], (…, 3); grey for nan."""
     colors = matplotlib.colormaps["inferno"](np.nan_to_num(values))[..., :3]
     return np.where(np.isfinite(values)[..., None], colors, GREY)
 

@@ -1,4 +1,4 @@
-"""The command that repeats a run: the words that make its config of conf/."""
+"""The command that repeats a run: the words that compose its config from conf/."""
 
 import math
 import shlex
@@ -15,14 +15,14 @@ from emgs_jax.config.schema import SCHEMAS, schema_of
 from emgs_jax.config.values import field_of
 from emgs_jax.io.files import flat, jsonable
 
-_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # of C where it is there: seventy files a report
+_LOADER = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # in C if available: a report reads seventy files
 
 
 class Repeated(NamedTuple):
     """Overrides of `emgs run` that repeat a run."""
 
-    words: list[str]  # that compose its config, groups first; a key that conf/ no longer has has a +
-    differences: list[tuple[str, Any, Any]]  # key, value and default of each; a default that is not there is ...
+    words: list[str]  # that compose its config, groups first; with + for a key that conf/ no longer has
+    differences: list[tuple[str, Any, Any]]  # key, value and default of each; ... for a missing default
 
     @property
     def command(self) -> str:
@@ -37,7 +37,7 @@ def repeat(settings: Mapping[str, Any]) -> Repeated:
     words = [f"{group}={option}" for group, option, _ in options]
     differences: list[tuple[str, Any, Any]] = list(options)
     config, made = compose(*words), len(words)
-    for follows_another in (False, True):  # what is taken from another key follows that one
+    for follows_another in (False, True):  # values taken from another key follow it
         if len(words) > made:
             config = compose(*words)
         composed = flat(jsonable(OmegaConf.to_container(config, resolve=True)))
@@ -53,9 +53,9 @@ def repeat(settings: Mapping[str, Any]) -> Repeated:
 
 
 def _infinity(config: DictConfig, key: str) -> float | None:
-    """The value for which null stands, as JSON has no infinity: that of an option of conf/, else an end of the range.
+    """Return the infinity that null stands for in JSON: that of an option of conf/, or an end of the range.
 
-    None where the key takes null.
+    None if the key itself takes null.
     """
     group, _, name = key.rpartition(".")
     node = OmegaConf.select(config, group) if group else None
@@ -92,7 +92,7 @@ def _default_options() -> dict[str, str]:
 
 
 def _content(path: Path) -> dict[str, Any]:
-    """Read values by dotted key of a file of conf/, with those that it inherits from others beside it."""
+    """Read values by dotted key from a file of conf/, including those that it inherits."""
     node, found = _read(path), {}
     for name, _, place in (str(line).partition("@") for line in node.pop("defaults", [])):
         parent, schema = path.parent / f"{name}.yaml", f"{path.parent.relative_to(CONF).as_posix()}/{name}"
@@ -106,7 +106,7 @@ def _read(path: Path) -> dict[str, Any]:
 
 
 def check_targets(settings: Any) -> None:
-    """Raise ValueError where settings name a class that conf/ does not: a file from elsewhere must not choose code."""
+    """Raise ValueError if settings name a class that conf/ does not, because a foreign file must not choose code."""
     trees = [{"": settings}, *map(_read, CONF.rglob("*.yaml")), *map(schema_of, SCHEMAS)]
     named, *known = ({v for key, v in flat(tree).items() if key.endswith("_target_")} for tree in trees)
     if unknown := named.difference(*known):

@@ -14,12 +14,12 @@ from emgs_jax.io.files import changes, jsonable
 from emgs_jax.runs.provenance import RESULT_FORMAT, ROWS, prefix_of
 
 METRICS_FILE = "metrics.json"
-_PLACES = ("dataset.root", "compilation_cache")  # say where things are, not what is computed
+_PLACES = ("dataset.root", "compilation_cache")  # places, not what is computed
 
 
 @contextmanager
 def sound(what: str, remedy: str = "run again") -> Iterator[None]:
-    """Raise one ValueError for whatever is wrong with the content of a file that is read inside of the `with`."""
+    """Turn any error about the contents of a file that the block reads into one ValueError."""
     try:
         yield
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError, yaml.YAMLError) as error:
@@ -44,7 +44,7 @@ class Estimate:
 
 
 def result_folder(out: Path, dataset: str, sequence: str, variant: str, seed: int) -> Path:
-    """Return the folder of one result; ValueError where a part is no name of one level, and it would be elsewhere."""
+    """Return the folder of one result; ValueError if a part is not a single name and would lead elsewhere."""
     parts = {"dataset": dataset, "sequence": str(sequence).replace("/", "_"), "variant or method": variant}
     for what, part in parts.items():
         if not re.fullmatch(r"[^/\\\0]+", part) or part in (".", ".."):
@@ -53,7 +53,7 @@ def result_folder(out: Path, dataset: str, sequence: str, variant: str, seed: in
 
 
 def read_metrics(path: Path, remedy: str = "move its folder away or choose another out=FOLDER") -> dict[str, Any]:
-    """Read a metrics.json of this version; any other raises ValueError, which says the remedy."""
+    """Read a metrics.json of this version; otherwise raise ValueError with the remedy."""
     with sound(f"{path} is not the result of a run", remedy):
         metrics = json.loads(path.read_text(encoding="utf-8"))
         found = metrics["provenance"].get("format")
@@ -63,7 +63,7 @@ def read_metrics(path: Path, remedy: str = "move its folder away or choose anoth
 
 
 def is_finished(folder: Path, config: Mapping[str, Any]) -> bool:
-    """Test whether the result is there; raises ValueError if it was made with another config."""
+    """Test whether the result exists; raise ValueError if it was made with another config."""
     path = folder / METRICS_FILE
     if not path.exists():
         return False
@@ -77,7 +77,7 @@ def is_finished(folder: Path, config: Mapping[str, Any]) -> bool:
 
 
 def read_estimates(out: Path) -> list[Estimate]:
-    """Read all results below `out`, in the order of their folders; one that is no seed's, such as a copy, is none."""
+    """Read all results below `out`, in the order of their folders; skip folders that are no seeds, such as copies."""
     paths = (path for path in sorted(out.glob(f"*/*/*/*/{METRICS_FILE}")) if path.parent.name.isdecimal())
     return [item for path in paths for item in estimates_of(path)]
 

@@ -1,4 +1,4 @@
-"""Words as vectors that the features of a finished map can be compared with, and the errors where they cannot."""
+"""Words as vectors to compare with the features of a finished map, and errors if they do not match."""
 
 import difflib
 from collections.abc import Mapping, Sequence
@@ -16,7 +16,7 @@ from emgs_jax.runs.finished_run import TEXT_FILE, FinishedRun
 
 @dataclass(frozen=True)
 class Vocabulary:
-    """Texts that a map can be queried for: those of `known`, or where `model` embeds any text."""
+    """Texts that a map can be queried for: those of `known`, or any text if there is a `model`."""
 
     source: str
     width: int  # of the map's features
@@ -24,7 +24,7 @@ class Vocabulary:
     model: FeatureModel | None = None
 
     def embed(self, names: Sequence[str]) -> TextEmbeddings:
-        """Embed names, in their order; raises ValueError where there is no vector of one or it is too wide."""
+        """Embed names in order; raise ValueError if one has no vector or one of another width."""
         text = self._find(tuple(names)) if self.model is None else self.model.embed(tuple(names))
         if text.vectors.shape != (len(names), self.width):
             widths = f"embeddings of width {text.vectors.shape[1]}, and the map's features have width {self.width}"
@@ -55,9 +55,9 @@ def feature_space(run: FinishedRun) -> dict[str, Any]:
 
 
 def vocabulary(run: FinishedRun, file: str | None, model: FeatureModel | None) -> Vocabulary:
-    """Choose the vocabulary for a run's map: of the file if given, else of the model, else the run's classes.
+    """Choose the vocabulary for a run's map: of the file, else of the model, else of the run's classes.
 
-    ValueError where the map has no features, or file or model are of other features; the message names both.
+    Raises ValueError if the map has no features, or if file or model belong to other features; the message names both.
     """
     path = run.folder / "map.npz"
     features = np.asarray(run.map.gaussians.features)[np.asarray(run.map.gaussians.valid)]
@@ -82,14 +82,14 @@ def vocabulary(run: FinishedRun, file: str | None, model: FeatureModel | None) -
 
 
 def feature_model(config: DictConfig, words: Sequence[str]) -> FeatureModel | None:
-    """Build the text encoder of a config; None with features=none, or where `features.text` has the embeddings."""
+    """Build the text encoder of a config; None with features=none, or if `features.text` has the embeddings."""
     if "_target_" not in config.features or config.features.text is not None:
         return None
     return build(config, "features", classes=list(words))
 
 
 def words_of(value: Any, key: str) -> tuple[str, ...]:
-    """Return one word or a list of them as a tuple; raises ValueError where one is empty, no text or there twice."""
+    """Return one word or a list of them as a tuple; raise ValueError if one is empty, not text or duplicated."""
     is_list = isinstance(value, Sequence) and not isinstance(value, str)
     words = list(value) if is_list else [] if value is None else [value]
     if not all(isinstance(word, str) and word.strip() for word in words) or len(set(words)) < len(words):

@@ -1,1 +1,1 @@
-"""The viewer in a browser, of a finished run or of one that is mapping."""
+"""The viewer in a browser, for a finished run or one that is mapping."""

@@ -12,22 +12,22 @@ from emgs_jax.drawing.colors import to_bytes
 from emgs_jax.semantics import answers
 
 REACH = 3.0  # standard deviations from its centre at which a Gaussian still stops a ray
-SURFACE = 0.03  # of the distance; Gaussians that are met so near behind the first are of one surface with it
+SURFACE = 0.03  # of the distance; Gaussians this near behind the first one belong to its surface
 _answers = eqx.filter_jit(answers)
-Layers = Mapping[str, np.ndarray]  # as `layers.map_layers` makes them, perhaps with `feature_layer`
+Layers = Mapping[str, np.ndarray]  # of `layers.map_layers`, perhaps with `feature_layer`
 
 
 class Answer(NamedTuple):
     """Result of a query for words in a map."""
 
-    cosines: np.ndarray  # of each Gaussian with the closest word that is asked for, (n,) in [0, 1]
-    is_found: np.ndarray  # (n,), closer to it than to all rivals, and close enough
+    cosines: np.ndarray  # of each Gaussian with the closest wanted word, (n,) in [0, 1]
+    is_found: np.ndarray  # (n,), closer to that word than to all rivals, and close enough
 
 
 def find_words(text: str, names: Sequence[str]) -> tuple[list[int], int]:
-    """Find rows of the class names in a text, words apart by commas, and how many of its words are no class.
+    """Find the rows of class names in a text with commas, and count its words that are no class.
 
-    A word that is being typed is the class that begins with it, where there is only one.
+    An incomplete word stands for the class that begins with it, if there is only one.
     """
     words = [word.strip().casefold() for word in text.split(",") if word.strip()]
     known, rows, num_unknown = [name.casefold() for name in names], [], 0
@@ -40,9 +40,9 @@ def find_words(text: str, names: Sequence[str]) -> tuple[list[int], int]:
 
 
 def ask(layers: Layers, wanted: Sequence[int], against: Sequence[int], min_cosine: float) -> Answer:
-    """Look for words in a map with classes, as `semantics.answers` does without a margin.
+    """Search a map with classes for words, as `semantics.answers` does without a margin.
 
-    Rows of the words that are asked for, at least one, are `wanted`; those of rivals are `against`.
+    `wanted` holds the rows of the words to find, at least one; `against` those of rivals.
     """
     count = len(layers["label"])
     fill = (0, (1 << (count - 1).bit_length()) - count)  # few sizes, as each compiles once
@@ -54,15 +54,15 @@ def ask(layers: Layers, wanted: Sequence[int], against: Sequence[int], min_cosin
 
 
 def highlighted(colors: np.ndarray, answer: Answer) -> np.ndarray:
-    """Return colours (n, 3), uint8, with what was found in the colour of its cosine, and everything else dark."""
+    """Return colours (n, 3), uint8: found Gaussians in the colour of their cosine, everything else dark."""
     hot = matplotlib.colormaps["inferno"](0.5 + 0.5 * answer.cosines)[:, :3]
     return to_bytes(np.where(answer.is_found[:, None], 0.25 * colors / 255.0 + 0.75 * hot, 0.25 * colors / 255.0))
 
 
 def picked(means: np.ndarray, covs: np.ndarray, origin: Sequence[float], direction: Sequence[float]) -> int | None:
-    """Find the Gaussian that a ray meets nearest to its centre on the first surface; None where there is none.
+    """Find the Gaussian that a ray meets nearest to its centre on the first surface; None without one.
 
-    What lies behind the origin is not met.
+    Gaussians behind the origin do not count.
     """
     ray, offsets = np.asarray(direction, np.float64), np.asarray(means, np.float64) - np.asarray(origin, np.float64)
     if not len(means):

@@ -1,7 +1,7 @@
-"""A run in the browser while it maps: how far it has come, every few seconds, from a thread of its own.
+"""Show a run in the browser while it maps: its progress every few seconds, drawn by a separate thread.
 
-A step makes new arrays and leaves the old ones as they are, so that the thread reads those of the last step while the
-next one is made. The run waits for nothing that is drawn.
+A step makes new arrays and leaves the old ones unchanged, so the thread can read those of the last step meanwhile. The
+run never waits for drawing.
 """
 
 import contextlib
@@ -25,20 +25,20 @@ from emgs_jax.runs.moving import with_moving
 from emgs_jax.viewer.scene import Shown
 from emgs_jax.viewer.viewer import Viewer
 
-SHARE = 0.05  # of the time in which the thread draws, at most
+SHARE = 0.05  # largest share of time in which the thread draws
 IMAGE_WIDTH = 320  # pixels
 
 
 @dataclass(frozen=True)
 class LiveConfig:
-    """Settings of the live view of a run that maps."""
+    """Settings of the live view."""
 
     port: int = number(low=1, high=65535)  # on 127.0.0.1
-    every_s: float = number(low=0.1, high=3600)  # seconds between two pictures, at least
+    every_s: float = number(low=0.1, high=3600)  # least seconds between two pictures
 
 
 class LiveView:
-    """A run that is watched until `stop`; ValueError where the port is taken, or viser is not installed.
+    """A run that is watched until `stop`; ValueError if the port is taken, or viser is not installed.
 
     Args:
         text: classes that features are compared with; None without.
@@ -53,7 +53,7 @@ class LiveView:
         self._image: np.ndarray | None = None  # of the last frame
 
     def show(self, run: MappingRun, image: np.ndarray) -> None:
-        """Show a run as it is, with the image of its last frame, where that is due and nothing is being drawn."""
+        """Show a run with the image of its last frame, if that is due and nothing is being drawn."""
         self._image = image
         if time.monotonic() >= self._due and self._drawing.done():
             self._begin(run)
@@ -79,7 +79,7 @@ class LiveView:
             self._drawing = self._thread.submit(self._draw, run.map, run.records, self._image)
 
     def _draw(self, map: GaussianMap, records: Sequence[FrameRecord], image: np.ndarray) -> None:
-        """Draw; a failure is printed, once, and the run continues without the live view."""
+        """Draw; on failure, print it once, and the run continues without the live view."""
         begin, step = time.monotonic(), -(-image.shape[1] // IMAGE_WIDTH)
         try:
             shown = replace(
@@ -102,7 +102,7 @@ class LiveView:
 def live_view(
     config: LiveConfig | None, run: MappingRun, render: RenderConfig, prior: Prior, kept: Sequence[int]
 ) -> Iterator[LiveView | None]:
-    """Serve a run inside the `with`, and say where; None, and nothing is served, without a config."""
+    """Serve a run during the block, and print the address; without a config, serve nothing and return None."""
     if config is None:
         yield None
         return

@@ -1,4 +1,4 @@
-"""A run as the viewer has it, finished or not, and its scene: the map, both paths, the cameras."""
+"""A run as the viewer shows it, finished or not, and its scene: the map, both paths, the cameras."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -16,33 +16,33 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import RenderConfig
 from emgs_jax.runs.finished_run import SPLATS_FILE, FinishedRun, placed_paths, render_config
 
-MAX_FRUSTUMS = 300  # more are a carpet; the chosen frame has its own
-KINDS = ("splats", "Gaussians", "points")  # as what a map is shown
+MAX_FRUSTUMS = 300  # more would hide the map; the chosen frame has its own
+KINDS = ("splats", "Gaussians", "points")  # ways to draw a map
 
 
 @dataclass(frozen=True)
 class Shown:
     """A run as the viewer has it."""
 
-    layers: Mapping[str, np.ndarray]  # as `map_layers` and `feature_layer` make them; empty before there is a map
+    layers: Mapping[str, np.ndarray]  # of `map_layers` and `feature_layer`; empty before there is a map
     names: tuple[str, ...]  # of the classes; none without
     frames: Sequence[Mapping[str, Any]]
     poses: np.ndarray  # T_world_camera of `frames`, (n, 4, 4)
     truth: np.ndarray  # true camera centres in the frame of the map, (n, 3); nan where unknown
     camera: Camera
     render: RenderConfig
-    image: np.ndarray | None = None  # of the last frame, uint8 (h, w, 3); None where nobody has it
-    splats: Splats | None = None  # of `emgs polish`; None where it was not run
+    image: np.ndarray | None = None  # of the last frame, uint8 (h, w, 3); None if unavailable
+    splats: Splats | None = None  # of `emgs polish`; None if it was not run
     owners: np.ndarray | None = None  # of `splats`, rows of `layers`
 
     @property
     def is_placed(self) -> np.ndarray:
-        """Of each frame, bool (n,): its pose means something; a lost one's is a guess."""
+        """Whether each frame's pose is meaningful, bool (n,); a lost frame's is a guess."""
         return np.array([frame["status"] not in UNPLACED for frame in self.frames], bool)
 
 
 def shown(run: FinishedRun) -> Shown:
-    """Show a finished run; raises ValueError where its parts do not fit each other."""
+    """Prepare a finished run; raise ValueError if its parts do not fit each other."""
     layers, names = map_layers(run.map, run.text) | feature_layer(run.map), () if run.text is None else run.text.names
     truth = placed_paths(run).truth[:, :3, 3]
     splats = read_splats(run.folder / SPLATS_FILE)
@@ -65,7 +65,7 @@ class Scene:
         self.covs = np.zeros((0, 3, 3), np.float32)  # of the Gaussians as they are drawn
 
     def draw(self, run: Shown, colors: np.ndarray) -> None:
-        """Show a run that has frames, in the place of what stands there, with colours (n, 3) of its Gaussians."""
+        """Show a run with frames in place of the current one, with colours (n, 3) of its Gaussians."""
         self.covs, means = covariances(run.layers), run.layers["mean"]
         opacities = np.full((len(means), 1), float(run.render.opacity), np.float32)
         if self.splats is not None:
@@ -89,7 +89,7 @@ class Scene:
             self._place_views(run.poses[0])
 
     def recolor(self, colors: np.ndarray, of_splats: np.ndarray | None) -> None:
-        """Give all Gaussians, if there are any, colours (n, 3), and likewise the splats."""
+        """Set colours (n, 3) of all Gaussians, and of the splats, if there are any."""
         if self.sharp is not None:
             self.sharp.rgbs = of_splats
         if self.splats is not None:
@@ -107,12 +107,12 @@ class Scene:
             frustum.visible = cameras
 
     def choose(self, pose: np.ndarray, image: np.ndarray | None) -> None:
-        """Put the frustum of the chosen frame at its pose, with its image if there is one."""
+        """Place the frustum of the chosen frame at its pose, with its image if there is one."""
         _place(self.chosen, pose)
         self.chosen.image = image
 
     def _draw_cameras(self, run: Shown) -> None:
-        """Draw the cameras; those that stand there are moved, as a back end moves poses."""
+        """Draw the cameras; move existing ones, because a back end moves poses."""
         count = len(run.poses)
         rows = {int(row) for row in np.linspace(0, count - 1, min(count, MAX_FRUSTUMS))}
         for row in set(self.frustums) - rows:
@@ -125,7 +125,7 @@ class Scene:
                 self.frustums[row] = self._frustum(run, f"/cameras/{row}", row, color, 0.04)
 
     def _path(self, name: str, centers: np.ndarray, is_known: np.ndarray, color: str) -> Any:
-        """Draw segments between neighbours that are both known; None where there are none."""
+        """Draw segments between neighbours that are both known; None if there are none."""
         joined = np.flatnonzero(is_known[1:] & is_known[:-1])
         if not len(joined):
             return None
@@ -144,7 +144,7 @@ class Scene:
         position, ahead, up = pose[:3, 3] - 0.3 * pose[:3, 2], pose[:3, 3] + pose[:3, 2], -pose[:3, 1]
         first = self._server.initial_camera
         first.position, first.look_at, first.up = position, ahead, up
-        for client in self._server.get_clients().values():  # who waits for the first frame
+        for client in self._server.get_clients().values():  # browsers that wait for the first frame
             client.camera.up_direction = up
             client.camera.position, client.camera.look_at = position, ahead
 

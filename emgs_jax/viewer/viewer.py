@@ -1,8 +1,8 @@
-"""A run in the browser, with viser: map, cameras, words to look for.
+"""A run in the browser, with viser: map, cameras, search for words.
 
-The server listens on this machine only. A page of another site can send to it all the same, so nothing that is sent is
-a path or a program: words are looked up among the class names of the run, numbers are places in its lists. Texts from
-the run's files are escaped before a browser shows them.
+The server listens on this machine only. Pages of other sites can still send to it, so no input is a path or a program:
+words are looked up among the class names of the run, and numbers are positions in its lists. Texts from the run's files
+are escaped before a browser shows them.
 """
 
 import socket
@@ -28,7 +28,7 @@ HOST = "127.0.0.1"
 
 
 def _alone(method: Callable) -> Callable:
-    """Make a method hold the viewer's lock: browsers and a run that maps call from several threads."""
+    """Make a method hold the viewer's lock, because browsers and a mapping run call from several threads."""
 
     @wraps(method)
     def locked(self: "Viewer", *arguments: Any) -> Any:
@@ -39,13 +39,13 @@ def _alone(method: Callable) -> Callable:
 
 
 class Viewer:
-    """A run that is being served until `stop`; ValueError where the port is taken, or viser is not installed."""
+    """A run that is being served until `stop`; ValueError if the port is taken, or viser is not installed."""
 
     def __init__(self, run: Shown, port: int) -> None:
         viser = extra("viser", "the viewer needs viser", "viewer")
         check_port(port)
         self.server = viser.ViserServer(host=HOST, port=port, label="emgs_jax", verbose=False)
-        if self.server.get_port() != port:  # taken since, by another program
+        if self.server.get_port() != port:  # taken meanwhile by another program
             self.server.stop()
             raise ValueError(_taken(port))
         self.server.gui.configure_theme(show_share_button=False, control_width="large")
@@ -57,7 +57,7 @@ class Viewer:
 
     @property
     def address(self) -> str:
-        """Return what to open in a browser of this machine."""
+        """Address to open in a browser of this machine."""
         return f"http://{HOST}:{self.server.get_port()}"
 
     def stop(self) -> None:
@@ -66,7 +66,7 @@ class Viewer:
 
     @_alone
     def update(self, run: Shown) -> None:
-        """Show how far a run has come; who looks at its last frame goes on to look at that."""
+        """Show the progress of a run; browsers that show its last frame follow it."""
         is_last = self._row() == max(len(self._run.frames) - 1, 0)
         with self.server.atomic():
             self._draw(run)
@@ -89,10 +89,10 @@ class Viewer:
             self.picture = self.server.gui.add_image(run.image, label="Newest frame")
 
     def _add_controls(self) -> None:
-        """Add the controls, the words first: people look for them."""
+        """Add the controls, search first, because people look for it."""
         gui, names = self.server.gui, self._names
         shown = layers_of({*ALWAYS, *self._run.layers, *(["label"] if names else [])})
-        titles = [layer.title for name, layer in shown.items() if name != "similarity"]  # that is what words show
+        titles = [layer.title for name, layer in shown.items() if name != "similarity"]  # shown by the search
         hint = "words of this run, apart by commas; what is closest to one of them lights up"
         self.words = gui.add_text("Look for", "", hint=hint)
         self.against = gui.add_text("Against", "", hint="what is closer to one of these words is left out")
@@ -124,7 +124,7 @@ class Viewer:
 
     @_alone
     def recolor(self) -> None:
-        """Colour the map as the controls say."""
+        """Colour the map according to the controls."""
         if not self._run.frames:
             return
         colors, of_splats, message = self._colors()
@@ -133,7 +133,7 @@ class Viewer:
         self.answer.content = _shown(message)
 
     def _colors(self) -> tuple[np.ndarray, np.ndarray | None, str]:
-        """Colour all Gaussians, (n, 3), and splats, and say what there is to say about the words."""
+        """Compute the colours of all Gaussians, (n, 3), and splats, and comment on the words."""
         name = next(name for name, layer in layers_of(self.layers).items() if layer.title == self.layer.value)
         colors, message = painted(self.layers, name), self._known()
         splats, rows = self._run.splats, self._run.owners
@@ -155,7 +155,7 @@ class Viewer:
 
     @_alone
     def pick(self, origin: Any, direction: Any) -> None:
-        """Say the numbers of the Gaussian under a ray."""
+        """Show the numbers of the Gaussian under a ray."""
         layers = self.layers
         row = picked(layers["mean"], self.scene.covs, origin, direction) if layers else None
         if row is None:
@@ -203,7 +203,7 @@ class Viewer:
 
 
 def check_port(port: int) -> None:
-    """Raise ValueError where a port is taken; viser would quietly take the next one."""
+    """Raise ValueError if a port is taken; viser would silently take the next one."""
     with socket.socket(socket.AF_INET, socket.SOCK_STREAM) as probe:
         probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
         try:

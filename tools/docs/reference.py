@@ -1,4 +1,4 @@
-"""Hook of mkdocs: pages that are made of the source, one of every key in `conf/`, one of every name of `emgs_jax`."""
+"""Hook of mkdocs: generate a page of every key in `conf/` and a page of every name of `emgs_jax`."""
 
 import ast
 from collections.abc import Iterator
@@ -9,15 +9,15 @@ from mkdocs.structure.files import File, Files
 
 ROOT = Path(__file__).parents[2]
 CONF, PACKAGE = ROOT / "conf", ROOT / "emgs_jax"
-KEYS = """# Keys
+KEYS = """# Every key
 
-Every file of `conf/`, as it is in this version. `emgs run --cfg job` prints the keys of a run with their values.
-A file `conf/GROUP/OPTION.yaml` is chosen with `GROUP=OPTION`; a key is changed with its path, `slam.em.noise=0.5`.
+Every file of `conf/` in this version. `emgs run --cfg job` prints the keys of a run with their values. `GROUP=OPTION`
+chooses the file `conf/GROUP/OPTION.yaml`; a path changes one key: `slam.em.noise=0.5`.
 """
 NAMES = """# Python
 
-What `import emgs_jax` gives, as it is in this version, in the order of the files that have it. A class that is listed
-with its fields takes them as arguments. [How it works](how_it_works.md) has an example.
+What `import emgs_jax` provides in this version, by file. A class takes the fields listed with it as arguments.
+[How it works](how_it_works.md#the-library-in-python) has an example.
 """
 
 
@@ -58,8 +58,8 @@ def outline(node: ast.FunctionDef | ast.ClassDef) -> ast.stmt:
 
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
-    """Add the pages to the site as `keys.md` and `names.md`, and CHANGELOG.md as `changes.md`."""
+    """Add the pages to the site as `every_key.md` and `names.md`, and CHANGELOG.md as `changes.md`."""
     changes = (ROOT / "CHANGELOG.md").read_text(encoding="utf-8")
-    for name, page in (("keys.md", keys()), ("names.md", names()), ("changes.md", changes)):
+    for name, page in (("every_key.md", keys()), ("names.md", names()), ("changes.md", changes)):
         files.append(File.generated(config, name, content=page))
     return files
