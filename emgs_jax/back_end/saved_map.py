@@ -59,13 +59,8 @@ class SavedMap:
 
 
 def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
-<<<<<<< HEAD
-    """Write what `load_places` reads."""
-    keyframes = _on_one_grid(end.database.keyframes)
-=======
     """Write the file that `load_places` reads."""
-    keyframes = end.database.keyframes
->>>>>>> h3
+    keyframes = _on_one_grid(end.database.keyframes)
     header = HEADER | {
         "depth_noise": depth_noise,
         "num_trained": end.database.num_trained,
