@@ -31,6 +31,7 @@ FILES = ("results.npz", "predictions.npz")
 PATCH = 14  # of VGGT's images, whose width is always 518
 SCANNET_UNITS = 1000.0  # per metre, in the 16-bit images that SensReader extracts
 DEPTH_MAPS = Path("stereo") / "depth_maps"
+STREAMED, STREAMED_POSES = "results_output", "camera_poses.txt"
 COLMAP_KINDS = (".geometric.bin", ".photometric.bin")  # the first that exists is read
 
 
@@ -163,6 +164,29 @@ def read_cut3r(folder: Path) -> Predictions:
     files = [*cameras, *(folder / kind / f"{path.stem}.npy" for path in cameras for kind in ("depth", "conf"))]
     names, source = [path.stem for path in cameras], f"{folder}/camera/*.npz: pose"
     return Predictions("CUT3R", names, np.concatenate(poses), source, read, files, False, dust3r_crop)
+
+
+def find_streaming(folder: Path) -> Path | None:
+    """The output folder of DA3-Streaming that a folder is, or whose `results_output` it is."""
+    places = [folder, *([folder.parent] if folder.name == STREAMED else [])]
+    return next((one for one in places if (one / STREAMED).is_dir() and (one / STREAMED_POSES).is_file()), None)
+
+
+def read_da3_streaming(folder: Path) -> Predictions:
+    """Read the output of DA3-Streaming: results_output/frame_N.npz of the images in order, and camera_poses.txt."""
+    found, path = list((folder / STREAMED).glob("frame_*.npz")), folder / STREAMED_POSES
+    paths = sorted(found, key=lambda file: int(file.stem.rpartition("_")[2]))
+    poses = as_poses(load_numbers(path, (-1, 4, 4)), str(path))
+    if len(poses) != len(paths):
+        raise ValueError(f"{path} has {len(poses)} poses for {len(paths)} files of {folder / STREAMED}: predict again")
+
+    def read(row: int) -> View:
+        arrays, where = load_npz(paths[row], ("depth", "intrinsics"), ("conf",)), f"{paths[row]}: "
+        confidence = arrays["conf"] + 1 if "conf" in arrays else None  # it counts from 0
+        return as_view(f"{where}depth", arrays["depth"], confidence, as_intrinsics(arrays["intrinsics"], where))
+
+    names = [f"row {row}" for row in range(len(paths))]
+    return Predictions("DA3-Streaming", names, poses, str(path), read, [*paths, path], False, whole_image)
 
 
 def read_colmap_workspace(folder: Path) -> Predictions:

@@ -33,8 +33,10 @@ from emgs_jax.prior.files.conventions import MIN_GAIN, Sight, check_conventions,
 from emgs_jax.prior.files.layouts import (
     DEPTH_MAPS,
     find_export,
+    find_streaming,
     read_colmap_workspace,
     read_cut3r,
+    read_da3_streaming,
     read_export,
     read_record3d,
     read_scannet,
@@ -194,6 +196,9 @@ def read_predictions(folder: Path, units_per_metre: float) -> Predictions:
     export = find_export(folder)
     if export is not None:
         return read_export(export)
+    streamed = find_streaming(folder)
+    if streamed is not None:
+        return read_da3_streaming(streamed)
     if (folder / DEPTH_MAPS).is_dir():
         return read_colmap_workspace(folder)
     if (folder / "depth").is_dir() and (folder / "camera").is_dir():

@@ -61,6 +61,18 @@ def write_cut3r(folder: Path) -> None:
         np.savez(folder / "camera" / f"{row:06d}.npz", pose=T.astype(np.float32), intrinsics=K)
 
 
+def write_da3_streaming(folder: Path) -> None:
+    """da3_streaming.py: results_output/frame_N.npz, whose confidence counts from 0, and camera_poses.txt."""
+    (folder / "results_output").mkdir()
+    depths, confidence, T, K = stacked()
+    for row, (depth, sure, camera) in enumerate(zip(depths, confidence, K, strict=True)):
+        path = folder / "results_output" / f"frame_{row}.npz"
+        np.savez_compressed(
+            path, image=np.zeros((*depth.shape, 3), np.uint8), depth=depth, conf=sure - 1, intrinsics=camera
+        )
+    (folder / "camera_poses.txt").write_text("\n".join(" ".join(map(repr, pose.ravel().tolist())) for pose in T))
+
+
 def write_colmap(folder: Path) -> None:
     """`colmap image_undistorter` and `patch_match_stereo`; of the last image no depth was found."""
     (folder / "sparse").mkdir()
@@ -109,6 +121,7 @@ def write_record3d(folder: Path) -> None:
 LAYOUTS = {
     "MapAnything": (write_mapanything, True, 1e-5, None),
     "Depth Anything 3": (write_depth_anything_3, False, 1e-5, None),
+    "DA3-Streaming": (write_da3_streaming, False, 1e-5, None),
     "CUT3R": (write_cut3r, False, 1e-5, None),
     "COLMAP": (write_colmap, False, 1e-5, -1),
     "ScanNet": (write_scannet, True, 0.9e-3, -1),  # half a millimetre along the ray
