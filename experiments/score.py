@@ -21,7 +21,7 @@ from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.prior.base import Provenance
 from emgs_jax.report.tables import average, full_table
 from emgs_jax.runs.metrics import true_cloud
-from emgs_jax.runs.provenance import provenance, write_metrics
+from emgs_jax.runs.provenance import PLACED_PERCENT, provenance, write_metrics
 from emgs_jax.runs.results import METRICS_FILE, estimates_of, is_finished, result_folder
 
 from .command import command
@@ -79,7 +79,8 @@ def matched_poses(
     truth = np.stack([known[row][1] for row in true_rows]).astype(np.float64)
     _check_twice(times, poses, path)
     check_conventions(poses[rows], truth, path)
-    return poses[rows], truth, {"score/num_poses": len(times), "score/num_frames": len(known)}
+    counts = {"score/num_poses": len(times), "score/num_frames": len(known)}
+    return poses[rows], truth, counts | {PLACED_PERCENT: 100.0 * len(rows) / len(known)}
 
 
 def _check_twice(times: np.ndarray, poses: np.ndarray, path: str) -> None:

@@ -59,7 +59,8 @@ class FrameRecord:
     """Outcome of one frame: a line of frames.jsonl. Fields of a step are None for a frame that was no step.
 
     Args:
-        status: tracked, degraded (the coarse pose stays, nothing is fused), lost (not even that is known),
+        status: tracked, degraded (the coarse pose stays, nothing is fused), lost (the prior says no pose, and
+            this one is a guess),
             initialization (the map was made from it), apart (in a submap that was never joined with the map) or skipped
             (it cannot be read).
         location: outcome of relocalization: `relocalized`, and the run continues from there; `restarted`, and the map

@@ -21,7 +21,7 @@ from emgs_jax.gaussians import MIN_ROWS, REFERENCE
 from emgs_jax.loop_closure.prior_query import PriorQuery
 from emgs_jax.mapping.atlas import Atlas, unvisited
 from emgs_jax.mapping.convert import to_camera
-from emgs_jax.mapping.records import APART, FrameRecord
+from emgs_jax.mapping.records import UNPLACED, FrameRecord
 from emgs_jax.ops.camera import Camera
 from emgs_jax.slam import SlamConfig, SlamState
 
@@ -151,16 +151,22 @@ def row_of_first_node(run: MappingRun) -> int:
 
 
 def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
-    """Return poses and true poses (n, 4, 4) of the frames whose truth is known; None without any.
+    """Return poses and true poses (n, 4, 4) of the placed frames whose truth is known; None without any.
 
-    Frames of submaps that were never joined are left out, because their poses are in a world of their own.
+    Poses of lost frames are guesses, and those of submaps that were never joined are in a world of their own.
     """
     rows = zip(poses, run.true_poses, run.records, strict=True)
-    pairs = [(pose, true) for pose, true, record in rows if true is not None and record.status != APART]
+    pairs = [(pose, true) for pose, true, record in rows if true is not None and record.status not in UNPLACED]
     if not pairs:
         return None
     estimate, truth = zip(*pairs, strict=True)
     return np.stack(estimate), np.stack(truth).astype(np.float64)
+
+
+def placed_percent(run: MappingRun) -> float:
+    """Return the share of the frames with a true pose that are placed in the map; what `with_truth` is of."""
+    statuses = [record.status for record, true in zip(run.records, run.true_poses, strict=True) if true is not None]
+    return 100.0 * float(np.mean([status not in UNPLACED for status in statuses])) if statuses else 0.0
 
 
 def _stacked(poses: Sequence[np.ndarray]) -> np.ndarray:

@@ -8,7 +8,7 @@ import io
 from collections.abc import Collection, Hashable, Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
-from emgs_jax.runs.provenance import OWN_UNITS, ROWS
+from emgs_jax.runs.provenance import OWN_UNITS, PLACED_PERCENT, ROWS
 
 DASH = "–"
 
@@ -23,6 +23,7 @@ class Column(NamedTuple):
     is_lower_better: bool
 
 
+SHARE = Column(PLACED_PERCENT, "placed [%]", 1.0, 1, False)  # of the frames that the errors are of
 MAIN = (
     Column("trajectory/ate_sim3_m", "ATE [cm]", 100.0, 2, True),
     Column("reconstruction/accuracy_m", "accuracy [cm]", 100.0, 2, True),
@@ -69,7 +70,13 @@ class Line(NamedTuple):
 
 def known(columns: Iterable[Column], rows: Sequence[Mapping[str, Any]]) -> list[Column]:
     """Keep the columns in which some row has a value."""
-    return [column for column in columns if any(row.get(column.key) is not None for row in rows)]
+    return [column for column in if_lacking(columns, rows) if any(row.get(column.key) is not None for row in rows)]
+
+
+def if_lacking(columns: Iterable[Column], rows: Iterable[Mapping[str, Any]]) -> list[Column]:
+    """Keep the share of placed frames only if some row lacks a frame."""
+    is_whole = all(row.get(SHARE.key) in (None, 100) for row in rows)
+    return [column for column in columns if column != SHARE or not is_whole]
 
 
 def in_unit(columns: Iterable[Column], data: Collection[str]) -> list[Column]:

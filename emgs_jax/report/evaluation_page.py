@@ -10,7 +10,7 @@ from emgs_jax.report.columns import MAIN, Cell, Line, Table, known, metric_table
 from emgs_jax.report.html import MAX_LINES, Head, link, page, picture, thumbnails, write_page
 from emgs_jax.report.tables import COLUMNS, Row, over
 from emgs_jax.runs.finished_run import REPORT_FILE
-from emgs_jax.runs.provenance import RAW_PRIOR, length_words
+from emgs_jax.runs.provenance import PLACED_PERCENT, RAW_PRIOR, length_words
 from emgs_jax.runs.results import METRICS_FILE, Estimate, read_metrics
 
 
@@ -71,7 +71,9 @@ def run_facts(metrics: Mapping[str, Any]) -> str:
     """Describe a run in one line: the path's error beside the prior's, and the frames."""
     ours, raw = (metrics.get(prefix + MAIN[0].key) for prefix in ("", RAW_PRIOR))
     block = metrics.get("provenance", {})
-    words = ["no ground truth"] if ours is None else [f"path off by {length_words(ours, block)}"]
+    share = metrics.get(PLACED_PERCENT, 100)
+    of = "" if share == 100 else f" over {share:.0f} % of the frames"
+    words = ["no ground truth"] if ours is None else [f"path off by {length_words(ours, block)}{of}"]
     if ours is not None and raw is not None:
         words[0] += f" (prior alone: {length_words(raw, block)})"
     counts = {status: metrics.get(f"frames/{status}") for status in ("tracked", "degraded", "lost", "skipped")}

@@ -7,7 +7,7 @@ from typing import Any
 from omegaconf import OmegaConf
 
 from emgs_jax.io.files import write_file
-from emgs_jax.report.columns import MAIN, Line, Table, csv_text, known, markdown, metric_table
+from emgs_jax.report.columns import MAIN, SHARE, Line, Table, csv_text, known, markdown, metric_table
 from emgs_jax.runs.results import METRICS_FILE, read_metrics
 
 OVERRIDES = Path(".hydra", "overrides.yaml")  # the words of a run, as stored by Hydra
@@ -44,7 +44,7 @@ def _differs(key: str, given: Sequence[Mapping[str, str]]) -> bool:
 def table_of(keys: Sequence[str], rows: Sequence[Mapping[str, Any]]) -> Table:
     """Lay out the main metrics of all runs; mark the best of each data set."""
     lines = [Line([row["run"], *(row[key] for key in keys)], row, rivals=row["data"]) for row in rows]
-    return metric_table(["run", *keys], known(MAIN, rows), lines, {row["data"] for row in rows})
+    return metric_table(["run", *keys], known((MAIN[0], SHARE, *MAIN[1:]), rows), lines, {row["data"] for row in rows})
 
 
 def write_multirun(folder: Path) -> Table:

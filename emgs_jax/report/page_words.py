@@ -11,6 +11,7 @@ from emgs_jax.report.columns import (
     MAIN,
     PLACED,
     RENDERED,
+    SHARE,
     Column,
     Line,
     Table,
@@ -29,7 +30,7 @@ from emgs_jax.runs.results import sound
 MANY_LOST = 0.1  # share of the frames
 MAX_LOOPS = 500  # largest number listed
 _SE3 = Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
-_COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), _SE3, *PLACED[:1], *PLACED[3:4], *BY_PATH, *RENDERED)
+_COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), SHARE, _SE3, *PLACED[:1], *PLACED[3:4], *BY_PATH, *RENDERED)
 FILES = {
     "report.html": "this page; any browser of 2023 or later",
     "overview.png": "the map from above with both paths, some frames; any viewer of images",

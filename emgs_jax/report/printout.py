@@ -17,7 +17,18 @@ from emgs_jax.mapping.records import (
     main_reason,
 )
 from emgs_jax.ops.ranges import MAX_LENGTH_M
-from emgs_jax.report.columns import BY_PATH, MAIN, PLACED, RENDERED, Table, aligned, lines_of, metric_table
+from emgs_jax.report.columns import (
+    BY_PATH,
+    MAIN,
+    PLACED,
+    RENDERED,
+    SHARE,
+    Table,
+    aligned,
+    if_lacking,
+    lines_of,
+    metric_table,
+)
 from emgs_jax.runs.moving import MUCH
 
 MANY = 0.1  # share of frames
@@ -89,9 +100,10 @@ def metrics_table(metrics: Mapping[str, Any]) -> str:
     """
     block, tables = metrics.get("provenance", {}), []
     names = [str((block.get("data") or {}).get("name"))]
-    for columns in ((MAIN[0], *PLACED), (*BY_PATH, *RENDERED)):
+    for columns in ((MAIN[0], SHARE, *PLACED), (*BY_PATH, *RENDERED)):
         if lines := lines_of(metrics, columns):
-            tables.append(aligned(metric_table([_label(block)], columns, lines, names)))
+            shown = if_lacking(columns, [metrics])
+            tables.append(aligned(metric_table([_label(block)], shown, lines, names)))
     return "\n\n".join(tables)
 
 

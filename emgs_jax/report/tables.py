@@ -11,11 +11,13 @@ from emgs_jax.report.columns import (
     MAIN,
     PLACED,
     RENDERED,
+    SHARE,
     Column,
     Line,
     Table,
     cell,
     csv_text,
+    if_lacking,
     markdown,
     metric_table,
 )
@@ -32,6 +34,7 @@ _PAPER_COLUMNS = (  # title, key, digits; the order of the paper's Table II
 )
 COLUMNS = (
     MAIN[0]._replace(title="ATE Sim(3) [cm]"),
+    SHARE,
     Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True),
     *MAIN[1:],
     *PLACED,
@@ -113,7 +116,9 @@ def full_table(rows: Sequence[Row]) -> str:
         labels = [row.dataset, over(row.sequences), method, source_of(row), row.protocol, str(len(row.seeds))]
         lines.append(Line(labels, row.values, row.spreads, rivals=None))
     titles = ["data set", "sequence", "method", "source", "protocol", "seeds"]
-    return markdown(metric_table(titles, COLUMNS, lines, {row.dataset for row in rows}))
+    return markdown(
+        metric_table(titles, if_lacking(COLUMNS, [row.values for row in rows]), lines, {row.dataset for row in rows})
+    )
 
 
 def over(sequences: Sequence[str]) -> str:

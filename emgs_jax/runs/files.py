@@ -66,7 +66,9 @@ def save_progress(folder: Path, run: MappingRun) -> None:
     """
     _complete_lines(folder / FRAMES_FILE, run)
     if run.state is not None:
-        _save_path_and_map(folder, run.records, run.poses, run.state.map)
+        placed = [row for row, record in enumerate(run.records) if record.status not in UNPLACED]
+        path = [run.records[row] for row in placed], [run.poses[row] for row in placed]
+        _save_path_and_map(folder, *path, run.state.map)
     for number, state in run.apart.items():  # in its own world and unit
         submap, records = folder / "submaps" / str(number), records_apart(run.records, number)
         submap.mkdir(parents=True, exist_ok=True)
@@ -76,15 +78,18 @@ def save_progress(folder: Path, run: MappingRun) -> None:
         save_places(folder / "places.npz", end, float(run.state.estimate.depth_noise))
     online = [] if end is None else [node.online for node in end.nodes[end.first_node :]]
     if online:
-        placed = [record.timestamp for record in run.records[-len(online) :]]
-        save_trajectory_tum(folder / "trajectory_online.txt", placed, np.stack(online))
+        rows = zip(run.records[-len(online) :], online, strict=True)
+        placed = [(record.timestamp, pose) for record, pose in rows if record.status not in UNPLACED]
+        times, poses = zip(*placed, strict=True) if placed else ((), np.zeros((0, 4, 4)))
+        save_trajectory_tum(folder / "trajectory_online.txt", times, np.asarray(poses))
         write_json(folder / LOOPS_FILE, loop_list(end))
         if end.factors:  # a single frame has no measurements
             save_graph_g2o(folder / "graph.g2o", metric_graph(end))
 
 
 def _save_path_and_map(folder: Path, records: Sequence[FrameRecord], poses: Sequence[np.ndarray], map: GaussianMap):
-    save_trajectory_tum(folder / "trajectory.txt", [record.timestamp for record in records], np.stack(poses))
+    times = [record.timestamp for record in records]
+    save_trajectory_tum(folder / "trajectory.txt", times, np.reshape(poses, (-1, 4, 4)))
     save_map(folder / "map.npz", map)
 
 

@@ -46,8 +46,8 @@ class FinishedRun:
     metrics: dict[str, Any]
     frames: list[dict[str, Any]]  # lines of frames.jsonl that have a pose, in order
     skipped: list[dict[str, Any]]  # the other lines
-    poses: np.ndarray  # the final ones
-    online: np.ndarray | None  # as first estimated; nan before the back end begins, None without one
+    poses: np.ndarray  # the final ones; where `is_placed` is false a guess
+    online: np.ndarray | None  # as first estimated; nan before the back end begins or unplaced, None without one
     raw: np.ndarray  # of the prior, nan where unknown
     truth: np.ndarray  # nan where unknown
     map: GaussianMap
@@ -87,18 +87,20 @@ def read_run(folder: Path) -> FinishedRun:
     _check_metrics(folder / METRICS_FILE, metrics)
     lines = _lines(folder / FRAMES_FILE)
     frames = [line for line in lines if line.get("pose") is not None]
-    _, poses = load_trajectory_tum(folder / "trajectory.txt")
-    if len(frames) != len(poses):
-        counts = f"frames.jsonl has {len(frames)} poses and trajectory.txt {len(poses)}"
+    placed = [row for row, line in enumerate(frames) if line["status"] not in UNPLACED]
+    _, path = load_trajectory_tum(folder / "trajectory.txt")
+    if len(placed) != len(path):
+        counts = f"frames.jsonl has {len(placed)} frames that are placed and trajectory.txt {len(path)}"
         raise ValueError(f"{folder}: {counts}: they are of two runs, or one was cut off; run again")
-    raw, truth = (_poses(folder / FRAMES_FILE, frames, name) for name in ("raw_pose", "true_pose"))
+    poses, raw, truth = (_poses(folder / FRAMES_FILE, frames, name) for name in ("pose", "raw_pose", "true_pose"))
+    poses[placed] = path
     return FinishedRun(
         folder=folder,
         metrics=metrics,
         frames=frames,
         skipped=[line for line in lines if line.get("pose") is None],
         poses=poses,
-        online=_online(folder / "trajectory_online.txt", len(poses)),
+        online=_online(folder / "trajectory_online.txt", placed, len(poses)),
         raw=raw,
         truth=truth,
         map=load_map(folder / "map.npz"),
@@ -143,13 +145,17 @@ def _poses(path: Path, frames: list[dict[str, Any]], name: str) -> np.ndarray:
         return from_tum(np.array(rows, np.float64).reshape(len(frames), 7))
 
 
-def _online(path: Path, count: int) -> np.ndarray | None:
+def _online(path: Path, placed: list[int], count: int) -> np.ndarray | None:
+    """Return the poses as first estimated of the last of the rows that are placed, nan elsewhere."""
     if not path.is_file():
         return None
-    _, placed = load_trajectory_tum(path)
-    if len(placed) > count:
-        raise ValueError(f"{path} has {len(placed)} poses and trajectory.txt {count}: they are of two runs; run again")
-    return np.concatenate([np.full((count - len(placed), 4, 4), np.nan), placed])
+    _, poses = load_trajectory_tum(path)
+    if len(poses) > len(placed):
+        found = f"{len(poses)} poses and trajectory.txt {len(placed)}"
+        raise ValueError(f"{path} has {found}: they are of two runs; run again")
+    online = np.full((count, 4, 4), np.nan)
+    online[placed[len(placed) - len(poses) :]] = poses
+    return online
 
 
 def _camera(path: Path, metrics: dict[str, Any]) -> Camera:

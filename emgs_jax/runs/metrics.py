@@ -37,11 +37,11 @@ from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.geometry import scale_pose
 from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, FrameRecord, longest_row, records_apart
-from emgs_jax.mapping.run import MappingRun, row_of_first_node, with_truth
+from emgs_jax.mapping.run import MappingRun, placed_percent, row_of_first_node, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.runs.back_end import counts, found_loops
 from emgs_jax.runs.gathering import Baselines, RawPrior, Text
-from emgs_jax.runs.provenance import RAW_PRIOR, is_metric, prefixed
+from emgs_jax.runs.provenance import PLACED_PERCENT, RAW_PRIOR, is_metric, prefixed
 
 Metrics = dict[str, Any]
 STATUSES = ("tracked", "degraded", "lost", APART, "initialization")
@@ -103,14 +103,26 @@ def score_map(
     if poses is None:
         return {}
     other = replace(config, alignment="se3" if config.alignment == "sim3" else "sim3")
-    metrics = trajectory_metrics(*poses) | score_cloud(dense, poses, scorer)
+    metrics = trajectory_metrics(*poses) | {PLACED_PERCENT: placed_percent(run)} | score_cloud(dense, poses, scorer)
     if other.alignment == "sim3" or scorer.is_metric:
         compared = compare_clouds(dense, truth, poses, other)
     else:
         compared = not_compared(other, "the prior's unit is not the metre") | {"reconstruction/alignment_note": None}
     metrics |= _renamed(compared, f"reconstruction_{other.alignment}/")
     metrics |= _renamed(compare_clouds(centers, truth, poses, config), "reconstruction_centers/")
-    return metrics | _score_labels(labels, poses, scorer)
+    return metrics | _score_labels(labels, poses, scorer) | _score_apart(run)
+
+
+def _score_apart(run: MappingRun) -> Metrics:
+    """Score the paths of submaps that were never joined, each aligned by itself."""
+    found: Metrics = {}
+    for number in run.apart:
+        rows = [record for record in records_apart(run.records, number) if record.true_pose is not None]
+        found[f"submaps/{number}/num_frames"] = len(rows)
+        if rows:
+            poses = (np.stack([getattr(row, name) for row in rows]) for name in ("pose", "true_pose"))
+            found[f"submaps/{number}/ate_sim3_m"] = trajectory_metrics(*poses)["trajectory/ate_sim3_m"]
+    return found
 
 
 def score_cloud(cloud: PointCloud | SpooledCloud, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer) -> Metrics:
@@ -140,7 +152,8 @@ def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
         rendered.add(row, raw.points[row][..., 2], None, names and translate(raw.classes[row], *names))
     with ThreadPoolExecutor(1, "classes of the raw prior") as thread:
         of_labels = thread.submit(_score_labels, raw.labels, poses, scorer)
-        metrics = trajectory_metrics(*poses) | score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
+        metrics = trajectory_metrics(*poses) | {PLACED_PERCENT: placed_percent(run)}  # over the frames of ours
+        metrics |= score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
         return prefixed(metrics | of_labels.result(), RAW_PRIOR)
 
 

@@ -17,6 +17,7 @@ from emgs_jax.prior.base import Provenance
 
 RESULT_FORMAT = 1  # of metrics.json; results of another format are refused
 OWN_UNITS = ("colmap", "nerfstudio")  # data sets whose true poses have their own unit
+PLACED_PERCENT = "trajectory/placed_percent"  # frames with a true pose that the path has
 RAW_PRIOR = "raw_prior/"  # prefix of the same metrics for the raw prior
 ROWS = {  # prefix of the metrics of an estimate -> what it is
     "": "ours",

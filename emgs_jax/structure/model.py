@@ -6,7 +6,6 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 from tqdm import tqdm
 
 from emgs_jax.data.masks import stem
@@ -37,12 +36,11 @@ class Structure:
     # the camera's axes; NaN where unknown.
     covariance: np.ndarray
     landmarks: Sequence[np.ndarray]  # rows of the world's points that each frame shows
-    is_interpolated: np.ndarray  # (n,) the pose is interpolated, without landmarks
 
     @property
     def is_placed(self) -> np.ndarray:
         """(n,) frames with a pose from landmarks."""
-        return (self.world != NONE) & ~self.is_interpolated
+        return self.world != NONE
 
     def shown(self, frame: int) -> np.ndarray:
         """The landmarks (k, 3) of a frame, in its world."""
@@ -84,9 +82,9 @@ def to_structure(models: Sequence[Any], names: Sequence[str], config: StructureC
             covariance[frame] = spread.get(frame, np.nan)
             shown = {place[point.point3D_id] for point in image.points2D if point.has_point3D()}
             landmarks[frame] = np.array(sorted(shown), int)
-    structure = Structure(worlds, world, T, covariance, landmarks, np.zeros(count, bool))
+    structure = Structure(worlds, world, T, covariance, landmarks)
     own = config.model is not None and _is_usual(structure)
-    return interpolated(structure if own else in_unit(structure, config.median_depth), config.max_gap)
+    return structure if own else in_unit(structure, config.median_depth)
 
 
 def _is_usual(structure: Structure) -> bool:
@@ -122,21 +120,3 @@ def scaled(structure: Structure, factors: Sequence[float]) -> Structure:
         covariance[frames] = scale_covariance(covariance[frames], factor)
     worlds = [replace(w, points=factor * w.points) for w, factor in zip(structure.worlds, factors, strict=True)]
     return replace(structure, worlds=worlds, T_world_camera=T, covariance=covariance)
-
-
-def interpolated(structure: Structure, max_gap: int) -> Structure:
-    """Interpolate the poses of at most `max_gap` frames in a row between two of one world."""
-    world, T, guessed = structure.world.copy(), structure.T_world_camera.copy(), structure.is_interpolated.copy()
-    placed = np.flatnonzero(structure.world != NONE)
-    for before, after in zip(placed[:-1], placed[1:], strict=True):
-        inside = np.arange(before + 1, after)
-        if not len(inside) or len(inside) > max_gap or structure.world[before] != structure.world[after]:
-            continue
-        share = (inside - before) / (after - before)
-        turns = Slerp([0, 1], Rotation.from_matrix(structure.T_world_camera[[before, after], :3, :3]))
-        ends = structure.T_world_camera[[before, after], :3, 3]
-        T[inside] = np.eye(4)
-        T[inside, :3, :3] = turns(share).as_matrix()
-        T[inside, :3, 3] = (1 - share)[:, None] * ends[0] + share[:, None] * ends[1]
-        world[inside], guessed[inside] = world[before], True
-    return replace(structure, world=world, T_world_camera=T, is_interpolated=guessed)

@@ -24,7 +24,7 @@ from emgs_jax.structure.reconstruct import Shots, map_images
 
 ABOUT = "structure.json"
 VERSION = 1  # changes with the code of `structure/`, if that makes other models of the same images
-NOT_OF_MODELS = ("model", "median_depth", "pixel_std", "max_gap")  # settings that do not change the models
+NOT_OF_MODELS = ("model", "median_depth", "pixel_std")  # settings that do not change the models
 CACHE = Path("~/.cache/emgs_jax/structure")
 
 

@@ -250,7 +250,10 @@ def damage(name: str, before: str, after: str):
         (("metrics.json", lambda text: text.replace('"intrinsics"', '"other"')), "which camera"),
         (damage("metrics.json", "emgs_jax.data.synthetic.Synthetic", "os.system"), "os.system"),
         (("frames.jsonl", lambda text: text + '{"index": 3\n'), "frames.jsonl:7 is no record"),
-        (("frames.jsonl", lambda text: "".join(text.splitlines(True)[:-1])), "5 poses and trajectory.txt 6"),
+        (
+            ("frames.jsonl", lambda text: "".join(text.splitlines(True)[:-1])),
+            "5 frames that are placed and trajectory.txt 6",
+        ),
         (damage("loops.json", "5", "77"), "loops.json names frames"),
         (damage("loops.json", '"accepted"', '"</script>"'), "loops.json names frames"),
         (("trajectory_online.txt", lambda text: text + 3 * text.splitlines()[-1] + "\n"), "expected"),

@@ -5,7 +5,7 @@ COLMAP finds the poses of all images (`structure/`). Depth is from a plane sweep
 (`monocular.py`). Its confidence is one over the standard deviation of log z (`depth_noise.py`), at least 1.
 
 Every model of COLMAP is a world with its own frame and unit: its landmarks get the median depth `median_depth`. A
-prediction has the poses of the current frame's world. A frame with an interpolated pose has no points: it is not fused.
+prediction has the poses of the current frame's world. A frame that no model holds has no pose.
 """
 
 from collections.abc import Sequence
