@@ -223,15 +223,6 @@ def random_candidates(count=40, seed=0):
     return sc.replace(discs(means, std=0.1), valid=np.arange(count) % 5 > 0)
 
 
-def test_every_valid_candidate_is_merged_or_fresh(settings, camera):
-    candidates = random_candidates()
-    _, fresh, info = run(settings, camera, candidates)
-    assert info.num_candidates == 32 == info.num_merged + info.num_fresh
-    assert info.num_merged > 0 and info.num_fresh > 0 and fresh.valid.sum() == info.num_fresh
-    assert not fresh.valid[::5].any()
-    sc.assert_same(sc.replace(fresh, valid=candidates.valid), candidates)
-
-
 def test_without_candidates_the_map_stays_bit_for_bit(settings, camera):
     nothing = sc.replace(random_candidates(), valid=np.zeros(40, bool))
     merged, fresh, info = run(settings, camera, nothing)
@@ -244,17 +235,6 @@ def test_an_empty_map_makes_every_candidate_fresh(settings, camera):
     merged, _, info = run(settings, camera, random_candidates(), empty)
     assert info.num_fresh == 32
     sc.assert_same(merged, map_of(empty))
-
-
-@pytest.mark.parametrize("poison", [1e6, np.nan])
-def test_invalid_candidates_and_map_rows_change_nothing(settings, camera, poison):
-    seen, candidates = sc.replace(discs(GRID), valid=np.arange(25) % 6 > 0), random_candidates()
-    known, new = np.asarray(seen.valid), np.asarray(candidates.valid)
-    clean = run(settings, camera, candidates, seen)
-    wild = run(settings, camera, sc.poisoned(candidates, new, poison), sc.poisoned(seen, known, poison))
-    sc.assert_same(wild[2], clean[2])
-    sc.assert_same(sc.rows_of(wild[0], known), sc.rows_of(clean[0], known))
-    sc.assert_same(sc.rows_of(wild[1], clean[1].valid), sc.rows_of(clean[1], clean[1].valid))
 
 
 def splats(means, is_valid) -> Splats:
