@@ -8,14 +8,12 @@ import jax
 import numpy as np
 import pytest
 from scene import slam_config
-from scipy.spatial import cKDTree
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose, dataset, exact, map_tiny
 
 from emgs_jax.config.configure import build
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.device.clock import Clock
-from emgs_jax.evaluation.reconstruction import ground_truth_cloud
 from emgs_jax.mapping import pipeline
 from emgs_jax.mapping.pipeline import finish_run, map_frames
 from emgs_jax.mapping.run import clamped, new_run
@@ -202,16 +200,6 @@ def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     raw = RawPrior(dense.cloud, Spool())
     assert score_map(blind, dense.cloud, dense.cloud, None, scorer) == score_prior(blind, raw, scorer) == {}
     assert dense.rendering == {}
-
-
-def test_the_densified_cloud_of_an_exact_run_lies_on_the_true_surfaces():
-    """Within the size of a Gaussian: 8 points of about 3 cm spacing."""
-    run, _ = exact()
-    protocol = hydra.utils.instantiate(compose().evaluation)
-    dense = dense_map(run, dataset(), hydra.utils.instantiate(compose().densify), protocol)
-    truth = ground_truth_cloud(list(dataset()), dataset().intrinsics, protocol)
-    distance, _ = cKDTree(truth.points).query(dense.cloud.points)
-    assert np.median(distance) < 0.03
 
 
 def test_the_map_does_not_start_at_the_origin_but_at_the_first_true_pose_and_at_the_identity_without_one():
