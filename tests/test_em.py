@@ -88,27 +88,6 @@ def test_an_update_equals_equations_2_to_4_one_item_at_a_time(paper, reading, nu
     np.testing.assert_array_equal(updated.num_updates[np.array(list(rows))], 2)
 
 
-@pytest.mark.parametrize(
-    ("field", "shut"), [("min_normal_cos", 1.01), ("max_mahalanobis_sq", 0.0), ("max_log_gap", -1.0)]
-)
-def test_each_gate_alone_shuts_everything_out_and_leaves_the_map_bit_for_bit(opened, field, shut):
-    updated, is_fused, info = em(MAP, POINTS, QUIET, sc.changed(opened, **{field: shut}))
-    assert not is_fused.any() and info.num_fused == 0 and info.num_updated == 0 and info.num_points == M
-    assert info.mean_log_joint == 0
-    sc.assert_same(updated, MAP)
-
-
-def test_the_gap_of_a_point_at_the_best_gaussians_mean_is_zero_and_grows_by_half_the_distance(opened):
-    """π: one Gaussian of unit covariance; a point 4 σ away with the same normal has a gap of 8."""
-    one = sc.replace(GAUSSIANS, covs=np.tile(np.eye(3), (N, 1, 1)), valid=np.arange(N) == 0)
-    mean, normal, feature = (np.asarray(x)[0] for x in (one.means, one.normals, one.features))
-    positions = mean + np.where(np.arange(M)[:, None] == 0, [4.0, 0, 0], 0.0)
-    points = sc.replace(POINTS, points=positions, normals=np.tile(normal, (M, 1)), features=np.tile(feature, (M, 1)))
-    for limit, expected in ((7.99, False), (8.01, True)):
-        step, _ = estep(one, points, QUIET, sc.changed(opened, max_log_gap=limit))
-        assert step.is_fused[0] == expected and step.is_fused[1:].all()
-
-
 def test_features_of_width_zero_are_as_good_as_a_zero_weight(opened):
     bare = lambda x: sc.replace(x, features=np.zeros((x.valid.shape[0], 0)))  # noqa: E731
     without, _ = estep(bare(GAUSSIANS), bare(POINTS), QUIET, opened)
