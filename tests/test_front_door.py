@@ -53,14 +53,11 @@ def test_importing_keeps_jax_quiet_unless_the_user_says_otherwise():
     assert python(without + said).split() == ["3"] == python(without + "import experiments, os; " + said).split()
 
 
-def test_dir_lists_what_is_there_for_users_and_nothing_that_it_is_made_with():
-    assert {name for name in dir(emgs_jax) if not name.startswith("__")} == {*emgs_jax.__all__} - {"__version__"}
-
-
-def test_every_name_is_there_and_none_is_hidden_by_a_folder_of_the_package():
+def test_every_name_is_there_and_no_other_and_none_is_hidden_by_a_folder_of_the_package():
     for name in emgs_jax.__all__:
         assert getattr(emgs_jax, name) is not None
-    assert set(emgs_jax.__all__) <= set(dir(emgs_jax)) and len(set(emgs_jax.__all__)) == len(emgs_jax.__all__)
+    listed = {name for name in dir(emgs_jax) if not name.startswith("__")}
+    assert listed == {*emgs_jax.__all__} - {"__version__"} and len({*emgs_jax.__all__}) == len(emgs_jax.__all__)
     inside = {path.stem for path in PACKAGE.iterdir()} | {"conf", "experiments"}
     assert not inside & set(emgs_jax.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):

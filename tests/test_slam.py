@@ -409,30 +409,6 @@ def predictions(window, count):
     return [window, *(exact(FRAME + i, has_newest=i < count - 1) for i in range(count))]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "capacities",
-    [
-        (ROOM // 2, 256),
-        pytest.param((64, 64), marks=pytest.mark.weekly),
-    ],  # each new size of the submap compiles the whole step
-)
-def test_growing_on_the_way_gives_the_same_map_as_starting_large(window, capacities):
-    def mapped(capacity, submap):
-        room = f"slam.submap.map_capacity={capacity}", f"slam.submap.submap_capacity={submap}"
-        return run(predictions(window, 3), lenient(*room))
-
-    small, infos = mapped(*capacities)
-    large, large_infos = mapped(ROOM, 256)
-    count = int(np.sum(large.map.gaussians.valid))
-    assert count > 100 and len(infos) == len(large_infos) == 3
-    assert small.map.weight.shape == (2 * capacities[0],)
-    assert all(int(i.overflow.map) == int(i.overflow.submap) == 0 for i in infos)
-    for a, b in zip(jax.tree.leaves(small.map), jax.tree.leaves(large.map), strict=True):
-        # Other shapes sum in another order.
-        np.testing.assert_allclose(np.asarray(a)[:count], np.asarray(b)[:count], atol=1e-4)
-
-
 @pytest.mark.parametrize("initialization", ["merged", "incremental"])
 def test_a_run_follows_the_exact_path_reports_every_step_and_repeats_bit_for_bit(window, initialization):
     chosen = sc.slam_config(*WHOLE, f"slam.initialization={initialization}")
@@ -470,19 +446,6 @@ def test_a_field_of_the_first_frames_fades_from_the_map(camera):
     sizes = [float(np.abs(i.localization.icp.field.nodes).max()) for i in infos]
     assert 0.06 < sizes[0] < 0.1, "what the map differs from the frame"
     assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 0.5 * sizes[0], "3 of 11 frames are wrong"
-
-
-def test_a_map_that_no_frame_has_made_becomes_what_the_frame_shows_its_field_included(state, settings, camera):
-    """1 / (W + 1) of what they differ is the map's error, with W before this frame: of a map without weight all."""
-    now = eqx.tree_at(lambda s: s.map.weight, state, sc.device(np.zeros(ROOM)))
-    sizes = []
-    for i in range(2):
-        given = sc.replace(exact(FRAME + i), **SURE)
-        given = eqx.tree_at(lambda p: p.current, given, sloping(given.current, camera))
-        now, info = step(now, given, FULL, settings)
-        assert info.localization.is_tracked
-        sizes.append(float(np.abs(info.localization.icp.field.nodes).max()))
-    assert sizes[0] > 0.06 and sizes[1] < 0.3 * sizes[0]
 
 
 # What a step is compiled for.
