@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 import hydra
-import jax
 import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
+from scene import same_bits
 from tiny_run import NUM_FRAMES, TINY, dataset
 
 import emgs_jax
@@ -106,11 +106,6 @@ def test_the_snippet_of_the_documentation_maps_a_sequence_in_two_ways_with_the_s
     np.testing.assert_allclose(run.raw_poses, truth, atol=1e-12)
     assert [record.status for record in run.records] == ["initialization"] + ["tracked"] * (NUM_FRAMES - 1)
     assert int(found["info"].num_gaussians) == run.records[-1].num_gaussians
-
-
-def same_bits(tree, other) -> bool:
-    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
 
 
 def test_settings_survive_a_hydra_program_around_them():

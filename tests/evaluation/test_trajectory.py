@@ -19,6 +19,7 @@ from emgs_jax.evaluation.trajectory import (
 )
 from emgs_jax.geometry import Sim3
 from emgs_jax.io.trajectory import load_trajectory_tum
+from tests.data.written_scene import scalar_first
 
 TRAJECTORIES = Path(__file__).resolve().parents[2].parent / "shared" / "data" / "trajectories"
 needs_trajectories = pytest.mark.skipif(not TRAJECTORIES.exists(), reason="the shared trajectories are not here")
@@ -237,20 +238,12 @@ def test_pose_alignment_is_point_alignment_where_positions_suffice_and_aligned_p
     np.testing.assert_array_equal(moved[:, 3], truth[:, 3])
 
 
-def as_read(pose):
-    """What a reader of x y z w makes of the pose's quaternion, written w x y z."""
-    changed = pose.copy()
-    w_x_y_z = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
-    changed[:3, :3] = Rotation.from_quat(w_x_y_z).as_matrix()
-    return changed
-
-
 @pytest.mark.parametrize(
     ("written", "words"),
     [
         (np.linalg.inv, "world -> camera:"),
         (lambda pose: pose * [1, -1, -1, 1], "camera -> world of OpenGL's axes:"),
-        (as_read, "with quaternions w, x, y, z:"),
+        (scalar_first, "with quaternions w, x, y, z:"),
     ],
 )
 def test_an_estimate_in_another_convention_is_named(written, words):

@@ -7,7 +7,7 @@ import hydra
 import jax
 import numpy as np
 import pytest
-from scene import slam_config
+from scene import same_bits, slam_config
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose, dataset, exact, map_tiny
 
 from emgs_jax.config.configure import build
@@ -26,11 +26,6 @@ from emgs_jax.runs.gathering import RawPrior
 from emgs_jax.runs.metrics import new_scorer, score_map, score_prior
 
 pytestmark = pytest.mark.xdist_group("tiny")
-
-
-def same_bits(tree, other) -> bool:
-    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
 
 
 class Counting:
