@@ -14,7 +14,6 @@ from emgs_jax.ops.pytree import (
     join_rows,
     put_rows,
     split_rows,
-    stack,
     static,
     take_rows,
     traced,
@@ -42,10 +41,6 @@ def test_a_choice_is_its_position_and_a_wrong_name_lists_the_right_ones():
         Example(1, "third", 3)
 
 
-def test_a_static_field_is_no_leaf():
-    assert len(jax.tree.leaves(Example(1, "first", 3))) == 2
-
-
 def test_taking_a_row_past_the_end_gives_the_last_row():
     taken = take_rows(ROWS, jnp.array([2, 0, 9]))
     np.testing.assert_array_equal(taken["a"], [2, 0, 3])
@@ -66,12 +61,6 @@ def test_where_chooses_whole_rows_even_against_nan():
     chosen = where_rows(mask, ROWS, poisoned)
     np.testing.assert_array_equal(chosen["b"][::2], np.asarray(ROWS["b"])[::2])
     assert np.isnan(chosen["b"][1::2]).all() and np.isnan(chosen["a"][1::2]).all()
-
-
-def test_a_stack_holds_every_tree_as_a_row():
-    stacked = stack([ROWS, jax.tree.map(lambda leaf: leaf + 1, ROWS)])
-    assert_same(jax.tree.map(lambda leaf: leaf[0], stacked), ROWS)
-    np.testing.assert_array_equal(stacked["a"][1], [1, 2, 3, 4])
 
 
 @pytest.mark.parametrize(
