@@ -41,6 +41,10 @@ def test_a_choice_is_its_position_and_a_wrong_name_lists_the_right_ones():
         Example(1, "third", 3)
 
 
+def test_a_static_field_is_no_leaf():
+    assert len(jax.tree.leaves(Example(1, "first", 3))) == 2
+
+
 def test_taking_a_row_past_the_end_gives_the_last_row():
     taken = take_rows(ROWS, jnp.array([2, 0, 9]))
     np.testing.assert_array_equal(taken["a"], [2, 0, 3])
