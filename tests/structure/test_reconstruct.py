@@ -168,7 +168,10 @@ def test_what_determines_no_structure_is_one_error_with_its_remedy(tmp_path, ima
 
 
 def test_masks_that_hide_all_are_named_and_one_of_another_size(tmp_path, images):
-    for shape, message in (((120, 160), "hardly anything to recognise.*masks.folder"), ((9, 9), "is 9x9, but")):
+    for shape, message in (
+        ((120, 160), "hardly anything to recognise.*masks.folder"),
+        ((9, 9), "is 9x9, but"),
+    ):
         for row in range(4):
             cv2.imwrite(str(tmp_path / f"{row:03d}.png"), np.zeros(shape, np.uint8))
         with pytest.raises(ValueError, match=message):
