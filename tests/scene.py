@@ -319,6 +319,11 @@ def assert_same(actual, expected):
         assert one.dtype == other.dtype and np.array_equal(one, other, equal_nan=is_float), (one, other)
 
 
+def same_bits(tree, other) -> bool:
+    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
+    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
+
+
 def assert_rows_near(actual, expected, atol, names=("means", "covs", "normals", "colors")):
     """These fields of two trees, within one tolerance."""
     for name in names:

@@ -22,36 +22,12 @@ CORE_ROOMS = (
 # What is solved between frames, by SciPy; the core does not import it.
 HOST_FILES = {"pose_graph.sparse", "pose_graph.chordal", "pose_graph.problem", "pose_graph.optimize"}
 HOST = (
-    "geometry",
-    "data",
-    "io",
-    "features",
-    "keypoints",
-    "loop_closure",
-    "structure",
-    "prior",
-    "evaluation",
-    "device",
-    "back_end",
-    "mapping",
-    "config",
-    "sequence",
-    "polish",
-    "drawing",
-    "runs",
-    "report",
-    "viewer",
+    *("geometry", "data", "io", "features", "keypoints", "loop_closure", "structure", "prior", "evaluation", "device"),
+    *("back_end", "mapping", "config", "sequence", "polish", "drawing", "runs", "report", "viewer"),
 )
 STAGES = {
-    "initialization",
-    "localization",
-    "em",
-    "surface_extrapolation",
-    "splitting",
-    "refinement",
-    "existence",
-    "motion",
-    "semantics",
+    *("initialization", "localization", "em", "surface_extrapolation", "splitting", "refinement", "existence"),
+    *("motion", "semantics"),
 }
 HOST_PACKAGES = {"numpy", "cv2", "open3d", "trimesh", "matplotlib", "scipy", "torch", "tqdm", "hydra", "omegaconf"}
 

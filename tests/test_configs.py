@@ -239,17 +239,6 @@ def test_every_field_of_a_config_class_is_read():
     assert unread == ONLY_WRITTEN
 
 
-def test_a_field_that_only_something_else_has_counts_as_unread():
-    source = """
-def f(config: IcpConfig, other):
-    icp = config
-    return icp.noise + other.color_std + config.a.residual
-"""
-    found = Reads(config_classes()).read(ast.parse(source))
-    assert ("IcpConfig", "noise") in found
-    assert not {("IcpConfig", "color_std"), ("IcpConfig", "residual")} & found
-
-
 def test_every_number_of_a_config_class_declares_its_range():
     """A threshold that takes any value takes nan; `emgs_jax.config.values` refuses what is out of range."""
     numeric = re.compile(r"\bint\b|\bfloat\b|Float\[")

@@ -55,14 +55,7 @@ from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.report.page import write_report
 from emgs_jax.runs.finished_run import read_run
 from tests.data.written_benchmarks import write_colmap, write_euroc, write_kitti, write_nerfstudio
-from tests.data.written_scene import (
-    color_image,
-    scene_pose,
-    write_images,
-    write_replica,
-    write_seven_scenes,
-    write_tum,
-)
+from tests.data.written_scene import color_image, scene_pose, write_images, write_replica, write_seven_scenes, write_tum
 from tests.written_run import written_run
 
 NUM_FRAMES, SIZE = 3, (48, 36)

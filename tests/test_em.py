@@ -9,9 +9,7 @@ import reference
 import scene as sc
 
 from emgs_jax.em import e_step, em_update, m_step, precision, support
-from emgs_jax.observation import Observation
 from emgs_jax.ops.linalg import whiten, whitening, widened_distance_sq
-from emgs_jax.registration.noise import level_edges, levels_of, noise_of_levels
 
 M, N, F = 60, 40, 3
 POINTS, GAUSSIANS = sc.random_observation(M, num_features=F), sc.random_gaussians(N, num_features=F)
@@ -90,42 +88,6 @@ def test_an_update_equals_equations_2_to_4_one_item_at_a_time(paper, reading, nu
     np.testing.assert_array_equal(updated.num_updates[np.array(list(rows))], 2)
 
 
-def test_without_terms_and_gates_they_are_the_posterior_of_a_textbook_mixture(opened):
-    config = sc.changed(opened, determinant_weight=0.5, normal_weight=0.0, feature_weight=0.0)
-    step, _ = estep(GAUSSIANS, POINTS, QUIET, config)
-    points, means, covs = (np.asarray(x, float) for x in (POINTS.points, GAUSSIANS.means, GAUSSIANS.covs))
-    for i in range(0, M, 7):
-        density = []
-        near = np.flatnonzero(dense(step)[i])
-        for k in near:
-            cov, offset = covs[k], points[i] - means[k]
-            exponent = -0.5 * offset @ np.linalg.inv(cov) @ offset
-            density.append(np.exp(exponent) / np.sqrt(np.linalg.det(2 * np.pi * cov)))
-        posterior = np.array(density) / np.sum(density)
-        np.testing.assert_allclose(dense(step)[i, near], posterior, atol=1e-3)  # exponents near 100, as above
-
-
-@pytest.mark.parametrize(
-    ("field", "shut"), [("min_normal_cos", 1.01), ("max_mahalanobis_sq", 0.0), ("max_log_gap", -1.0)]
-)
-def test_each_gate_alone_shuts_everything_out_and_leaves_the_map_bit_for_bit(opened, field, shut):
-    updated, is_fused, info = em(MAP, POINTS, QUIET, sc.changed(opened, **{field: shut}))
-    assert not is_fused.any() and info.num_fused == 0 and info.num_updated == 0 and info.num_points == M
-    assert info.mean_log_joint == 0
-    sc.assert_same(updated, MAP)
-
-
-def test_the_gap_of_a_point_at_the_best_gaussians_mean_is_zero_and_grows_by_half_the_distance(opened):
-    """π: one Gaussian of unit covariance; a point 4 σ away with the same normal has a gap of 8."""
-    one = sc.replace(GAUSSIANS, covs=np.tile(np.eye(3), (N, 1, 1)), valid=np.arange(N) == 0)
-    mean, normal, feature = (np.asarray(x)[0] for x in (one.means, one.normals, one.features))
-    positions = mean + np.where(np.arange(M)[:, None] == 0, [4.0, 0, 0], 0.0)
-    points = sc.replace(POINTS, points=positions, normals=np.tile(normal, (M, 1)), features=np.tile(feature, (M, 1)))
-    for limit, expected in ((7.99, False), (8.01, True)):
-        step, _ = estep(one, points, QUIET, sc.changed(opened, max_log_gap=limit))
-        assert step.is_fused[0] == expected and step.is_fused[1:].all()
-
-
 def test_features_of_width_zero_are_as_good_as_a_zero_weight(opened):
     bare = lambda x: sc.replace(x, features=np.zeros((x.valid.shape[0], 0)))  # noqa: E731
     without, _ = estep(bare(GAUSSIANS), bare(POINTS), QUIET, opened)
@@ -155,22 +117,6 @@ def test_a_missing_feature_says_nothing(paper, missing):
         np.testing.assert_allclose(best[::2], best_without[::2], atol=1e-5)
         np.testing.assert_array_equal(*(dense(s)[1::2] for s in (step, known)))
     assert 0 < is_fused.sum() < M
-
-
-def test_noise_along_the_ray_widens_the_gaussian_by_its_outer_product():
-    offsets = np.random.default_rng(0).normal(size=(M, 5, 3)) * 0.2
-    covs = np.asarray(sc.random_gaussians(M * 5).covs, float).reshape(M, 5, 3, 3)
-
-    triangle, *vectors = (
-        jnp.unstack(jnp.asarray(x, jnp.float32), axis=-1)
-        for x in (sc.on_host(whitening)(covs)[0], offsets, NOISE[:, None])
-    )
-    distance_sq, log_growth = widened(triangle, *vectors)
-    noise = np.asarray(NOISE, float)
-    whole = covs + (noise[:, :, None] * noise[:, None])[:, None]
-    expected = np.einsum("mki,mkij,mkj->mk", offsets, np.linalg.inv(whole), offsets)
-    np.testing.assert_allclose(distance_sq, expected, rtol=1e-3, atol=1e-3)  # a difference of values up to 500
-    np.testing.assert_allclose(log_growth, np.linalg.slogdet(whole)[1] - np.linalg.slogdet(covs)[1], atol=1e-4)
 
 
 def test_a_share_that_vanishes_moves_nothing(paper):
@@ -261,18 +207,6 @@ def test_many_points_are_taken_in_parts_which_changes_no_average(opened):
     sc.assert_rows_near(updated.gaussians, expected.gaussians, atol=1e-4)
 
 
-@pytest.mark.parametrize("poison", [1e6, -1e6])
-def test_invalid_rows_of_map_and_observation_change_no_valid_output(paper, poison):
-    known, valid = np.arange(N) % 4 > 0, np.arange(M) % 5 > 0
-    map, points = sc.fresh_map(sc.replace(GAUSSIANS, valid=known)), sc.replace(POINTS, valid=valid)
-    config = sc.changed(paper, **OPEN)
-    clean, clean_fused, clean_info = em(map, points, NOISE, config)
-    bad, bad_fused, bad_info = em(sc.poisoned(map, known, poison), sc.poisoned(points, valid, poison), NOISE, config)
-    sc.assert_same((bad_fused, bad_info), (clean_fused, clean_info))
-    sc.assert_same(sc.rows_of(bad, known), sc.rows_of(clean, known))
-    assert not clean_fused[~valid].any() and clean_info.num_points == valid.sum()
-
-
 def test_an_empty_submap_fuses_nothing_and_stays_finite(paper):
     empty = sc.fresh_map(sc.replace(GAUSSIANS, valid=np.zeros(N, bool)))
     updated, is_fused, info = em(empty, POINTS, QUIET, paper)
@@ -288,51 +222,6 @@ def test_precision_is_the_share_of_the_floor_in_a_points_variance(paper, noise):
     config = sc.changed(paper, noise=noise, min_std=0.01)
     found = sc.on_host(precision)(np.float32([[0.0, 0, 0], [0.006, 0, 0.008], [0, 0.1, 0]]), config)
     np.testing.assert_allclose(found, [1, 0.5, 1 / 101] if noise else [1, 1, 1], rtol=1e-6)
-
-
-def noisy_wall(seed: int):
-    """A wall of Gaussians 2 m away, and points that see it: one half errs by 1 % of the depth, the other by 6 %."""
-    rng = np.random.default_rng(seed)
-    x, y = (a.reshape(-1) for a in np.meshgrid(np.arange(-0.4, 0.41, 0.2), np.arange(-0.4, 0.41, 0.2)))
-    size = 2000
-    gaussians = sc.flat_gaussians(np.stack([x, y, 2.0 + 0 * x], 1), 0.06)
-    is_good = np.arange(size) % 2 > 0
-    error = np.where(is_good, 0.01, 0.06) * rng.normal(size=size)
-    rays = np.stack([*rng.uniform(-0.25, 0.25, (2, size)), np.ones(size)], 1)
-    points, towards = rays * (2.0 * (1 + error))[:, None], np.tile([0.0, 0, -1], (size, 1))
-    ones = np.ones(size)
-    arrays = points, np.full((size, 3), 0.5), towards, np.zeros((size, 0)), ones, ones > 0
-    return gaussians, Observation(*map(sc.device, arrays)), np.float32(error), is_good
-
-
-@sc.on_host
-def taken_in(gaussians, seen, error, confidence, config):
-    """The means after points whose noise is estimated by their confidence, and how many points each has."""
-    levels = levels_of(confidence, level_edges(confidence, seen.valid))
-    _, of_levels = noise_of_levels(error, seen.valid, levels)
-    noise = of_levels[levels][:, None] * seen.points
-    step, _ = e_step(gaussians, seen, noise, config)
-    new, total = m_step(gaussians, seen, precision(noise, config), step, config)
-    return new.means, total
-
-
-def error_of(claim, config, seed: int) -> float:
-    """Root mean square distance of the new means from the wall, for a confidence of each half of the points."""
-    gaussians, seen, error, is_good = noisy_wall(seed)
-    means, total = taken_in(gaussians, seen, error, np.float32(np.where(is_good, *claim)), config)
-    return np.sqrt(np.mean(np.where(total > 0, means[:, 2] - 2.0, 0.0) ** 2))
-
-
-@pytest.mark.slow
-def test_confidence_makes_a_map_better_and_a_wrong_one_not_worse(config):
-    """Another law than the simulator's: two levels. Claims are (of the good half, of the bad half)."""
-    chosen = config().em
-    errors = {
-        name: np.mean([error_of(claim, chosen, seed) for seed in range(8)])
-        for name, claim in {"honest": (5.0, 1.5), "none": (3.0, 3.0), "wrong": (1.5, 5.0)}.items()
-    }
-    assert errors["honest"] < 0.85 * errors["none"]
-    assert errors["wrong"] < 1.02 * errors["none"]
 
 
 @pytest.mark.parametrize(("noise", "depth"), [(0.02, 3e3), (0.1, 1e4), (0.3, 1e4)])

@@ -6,10 +6,10 @@ import sys
 from pathlib import Path
 
 import hydra
-import jax
 import numpy as np
 import pytest
 from hydra.core.global_hydra import GlobalHydra
+from scene import same_bits
 from tiny_run import NUM_FRAMES, TINY, dataset
 
 import emgs_jax
@@ -53,14 +53,11 @@ def test_importing_keeps_jax_quiet_unless_the_user_says_otherwise():
     assert python(without + said).split() == ["3"] == python(without + "import experiments, os; " + said).split()
 
 
-def test_dir_lists_what_is_there_for_users_and_nothing_that_it_is_made_with():
-    assert {name for name in dir(emgs_jax) if not name.startswith("__")} == {*emgs_jax.__all__} - {"__version__"}
-
-
-def test_every_name_is_there_and_none_is_hidden_by_a_folder_of_the_package():
+def test_every_name_is_there_and_no_other_and_none_is_hidden_by_a_folder_of_the_package():
     for name in emgs_jax.__all__:
         assert getattr(emgs_jax, name) is not None
-    assert set(emgs_jax.__all__) <= set(dir(emgs_jax)) and len(set(emgs_jax.__all__)) == len(emgs_jax.__all__)
+    listed = {name for name in dir(emgs_jax) if not name.startswith("__")}
+    assert listed == {*emgs_jax.__all__} - {"__version__"} and len({*emgs_jax.__all__}) == len(emgs_jax.__all__)
     inside = {path.stem for path in PACKAGE.iterdir()} | {"conf", "experiments"}
     assert not inside & set(emgs_jax.__all__)
     with pytest.raises(AttributeError, match="no attribute 'nothing'"):
@@ -109,11 +106,6 @@ def test_the_snippet_of_the_documentation_maps_a_sequence_in_two_ways_with_the_s
     np.testing.assert_allclose(run.raw_poses, truth, atol=1e-12)
     assert [record.status for record in run.records] == ["initialization"] + ["tracked"] * (NUM_FRAMES - 1)
     assert int(found["info"].num_gaussians) == run.records[-1].num_gaussians
-
-
-def same_bits(tree, other) -> bool:
-    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
 
 
 def test_settings_survive_a_hydra_program_around_them():

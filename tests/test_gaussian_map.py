@@ -57,14 +57,6 @@ def test_the_printed_gain_follows_its_recursion(average):
     assert map.num_updates == 5
 
 
-def test_the_counting_gain_gives_the_mean_of_all_frames(average):
-    values = [3.0, -1.0, 4.0, 1.0, -5.0, 9.0]
-    means, gains, _ = averaged(values, [1.0] * 6, average["count"])
-    expected = [np.mean([0.0, *values[: n + 1]]) for n in range(6)]  # the first frame's value was 0
-    np.testing.assert_allclose(means, expected, atol=1e-6)  # six roundings near 1
-    np.testing.assert_allclose(gains, 1 / np.arange(2, 8), rtol=1e-6)
-
-
 @pytest.mark.parametrize("kind", ["ema_printed", "count"])
 def test_uneven_evidence_gives_the_reference_average(average, kind):
     values, evidence = [3.0, -1.0, 4.0, 1.0], [0.2, 1.0, 0.05, 0.7]

@@ -80,16 +80,6 @@ def test_invalid_points_are_not_clustered(views, camera, config):
     assert not gaussians.valid.any() and weight.sum() == 0
 
 
-def test_the_map_moves_with_the_anchor(result, views, camera, config):
-    motion = sc.pose((0.7, 0.2, -0.4), (1.0, -2.0, 0.5))
-    moved, weight, _ = first_map(views, sc.stack_poses([sc.product(motion, T) for T in POSES]), camera, 1, config().fit)
-    expected = sc.move_gaussians(motion, result[0])
-    # A point half-way between two centroids may go to either, which moves both: most are equal to roundings.
-    error = np.abs(moved.means - expected.means).max(1)
-    assert np.median(error) < 1e-5 and error.max() < 0.05
-    np.testing.assert_allclose(weight.sum(), result[1].sum(), rtol=1e-5)
-
-
 @pytest.mark.slow
 def test_features_of_width_zero_are_possible(camera, config, result):
     views = sc.stack([sc.observe_room(T, camera) for T in POSES])

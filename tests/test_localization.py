@@ -147,20 +147,6 @@ def repeats_of(motion: float, own: float):
     return sc.replace(no_repeats(), log_squares=log_squares, counts=np.full(2, 1e6))
 
 
-def test_the_fused_pose_lies_between_chain_and_anchor_and_far_from_the_anchor_at_the_chain(wide, printed):
-    elsewhere = shifted(sc.predict_room(FRAME, wide), sc.pose(translation=(0.1, 0, 0)))
-    config = sc.changed(printed, coarse=COARSE["fused"], pose_shared=0.75)
-
-    def distance(motion, own):
-        estimate = eqx.tree_at(lambda b: b.repeats, CERTAIN, repeats_of(motion, own))
-        return sc.pose_error(coarse_of(elsewhere, wide, config, estimate=estimate).T_world_camera, sc.path_pose(FRAME))[
-            0
-        ]
-
-    assert distance(10.0, 1e-3) == pytest.approx(0.1, abs=1e-3)
-    assert distance(1e-3, 10.0) == pytest.approx(0.0, abs=1e-3)
-
-
 @pytest.mark.parametrize("ratio", [0.5, 1.0, 3.0])
 @pytest.mark.parametrize("shifted_by", [0.005, 0.1])
 def test_the_fused_pose_weighs_chain_and_anchor_by_their_variances(wide, printed, ratio, shifted_by):
@@ -322,20 +308,6 @@ def test_outliers_among_the_pairs_do_not_move_the_pose(wide, printed, reading):
     bad = sc.replace(previous, points=previous.points + np.where(np.arange(80 * 64)[:, None] % 7 == 0, 0.5, 0.0))
     result = coarse_of(sc.predict_room(FRAME, wide), wide, sc.at(printed, "coarse", COARSE[reading]), bad)
     assert sc.pose_error(result.T_world_camera, sc.path_pose(FRAME))[0] < 0.02
-
-
-@pytest.mark.parametrize("reading", COARSE)
-def test_invalid_rows_change_nothing(wide, printed, reading):
-    prediction, config = sc.predict_room(FRAME, wide), sc.at(printed, "coarse", COARSE[reading])
-    observations = prediction.current, prediction.previous, world(FRAME - 1, wide)
-    results = []
-    for value in (0.0, 1e6, -1e6):
-        masks = [np.arange(80 * 64) % step > 0 for step in (3, 4, 5)]
-        marked = [sc.replace(sc.poisoned(o, m, value), valid=m) for o, m in zip(observations, masks, strict=True)]
-        given = eqx.tree_at(lambda p: (p.current, p.previous), prediction, tuple(marked[:2]))
-        results.append(coarse_of(given, wide, config, marked[2]))
-    sc.assert_same(results[1], results[0])
-    sc.assert_same(results[2], results[0])
 
 
 @pytest.mark.parametrize("count", [0, 15, 16])
@@ -526,15 +498,6 @@ def test_a_step_may_be_as_long_as_a_share_of_the_mean_depth(camera, submap, leni
         assert limited.is_tracked == (allowed > 1)
 
 
-def test_an_empty_submap_is_too_few_points_that_agree(camera, submap, lenient):
-    empty = sc.replace(submap, valid=np.zeros(192, bool))
-    coarse, T, _, info = fine_of(
-        sc.predict_room(FRAME, camera), empty, camera, sc.at(lenient, "min_inlier_fraction", 0.1)
-    )
-    assert int(info.reason) & 2 and not info.is_tracked
-    sc.assert_same(T, coarse.T_world_camera)
-
-
 @pytest.mark.parametrize("residual", [0, 1, 2])
 def test_a_single_untextured_wall_does_not_determine_the_pose(camera, submap, lenient, config, residual):
     """With the configured limit; the room's other walls and all colour are taken away."""
@@ -579,44 +542,6 @@ def test_the_printed_form_knows_nothing_before_whatever_the_prior_says(camera, s
     sc.assert_same(known[0].T_world_camera, unknown[0].T_world_camera)
     sc.assert_same(known[1:3], unknown[1:3])
     sc.assert_same(known[3].icp, unknown[3].icp)
-
-
-def longer(T, unit: float):
-    return jaxlie.SE3(T.wxyz_xyz * sc.device([1.0] * 4 + [unit] * 3))
-
-
-def prediction_in(unit: float, prediction):
-    """The prediction with all lengths times a number."""
-    units = np.repeat([unit, 1.0], 3)
-    seen = [sc.replace(o, points=unit * np.asarray(o.points)) for o in (prediction.current, prediction.previous)]
-    poses = longer(prediction.T_world_views, unit), longer(prediction.T_world_anchor, unit)
-    covariance = sc.device(units[:, None] * np.asarray(prediction.pose_covariance) * units)
-    flags = prediction.has_newest, prediction.is_repeat
-    return type(prediction)(*seen, *poses, covariance, prediction.scale_std, *flags)
-
-
-@pytest.mark.parametrize("is_given", [False, True])
-def test_a_frame_is_placed_alike_in_every_unit_of_length(camera, submap, config, is_given):
-    """A world times 2^±10: the same decisions and counts, and lengths that are as many times as long."""
-    settings, found, prediction = config().localization, {}, nudged(camera)
-    prediction = given(prediction, 0.01, 0.01) if is_given else prediction
-    grey = sc.replace(submap, colors=np.full((192, 3), 0.5))  # gradients of colour are not a matter of this file
-    for unit in (2.0**-10, 1.0, 2.0**10):
-        before = world(FRAME - 1, camera)
-        before = sc.replace(before, points=unit * np.asarray(before.points))
-        target = sc.replace(grey, means=unit * np.asarray(grey.means), covs=unit**2 * np.asarray(grey.covs))
-        there, T_before = prediction_in(unit, prediction), longer(sc.path_pose(FRAME - 1), unit)
-        coarse = coarse_step(there, before, T_before, camera, settings, CERTAIN)
-        T, aligned, info = fine_step(there.current, target, coarse, settings)
-        covariance = np.asarray(info.estimate.covariance)[:6, :6] / np.outer(*[np.repeat([unit, 1.0], 3)] * 2)
-        lengths = aligned.points / unit, info.step_m / unit, info.repeat_rms / unit
-        others = info.noise, info.scale, info.step_rad, info.icp.min_eigenvalue
-        counts = bool(info.is_tracked), int(info.reason), int(info.icp.num_inliers), int(info.icp.num_steps)
-        found[unit] = counts, (longer(T, 1 / unit).wxyz_xyz, covariance, *lengths, *others)
-    for counts, numbers in found.values():
-        assert counts == found[1.0][0]
-        for one, expected in zip(numbers, found[1.0][1], strict=True):
-            np.testing.assert_allclose(one, expected, rtol=1e-4, atol=1e-5 * np.abs(expected).max())  # roundings
 
 
 @pytest.mark.parametrize("loss", ["no point", "nan pose"])

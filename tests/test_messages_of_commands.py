@@ -127,6 +127,15 @@ OF_EXPORT = [
     ((gone("run/points.ply"), {"formats": "'[colmap]'"}), "lacks points.ply, which formats=colmap needs: run again"),
     ({"images": "large", "formats": "'[colmap]'"}, "images must be one of (used), original"),
     (gone("run/metrics.json"), "finished run: it lacks metrics.json; run it to its end"),
+    *(
+        ({"length": f"'{given}'"}, r"length must be \[frame,frame,metres\]")
+        for given in ([1, 5], [1, 5, 0], [1.5, 5, 2])
+    ),
+    ({"length": "'[1,9,2]'"}, "frame 9 is none of the run's"),
+    ({"length": "'[1,3,2]'"}, "frame 3 is lost, so its pose is a guess"),
+    ({"length": "'[1,1,2]'"}, "these two cameras are at one place"),
+    ({"scale": "0"}, "scale must be .*, got 0"),
+    ({"scale": "2", "length": "'[1,5,2]'"}, "give one of them"),
 ]
 
 
@@ -145,6 +154,12 @@ OF_QUERY = [
     ({"words": "soaf"}, r"the nearest are (\w+)\."),
     ({"words": "xyz"}, r"there are wall, (\w+)\."),
     ({"words": "'[sofa,sofa]'"}, "none empty and each once"),
+    ({"words": "1"}, "text must be a word or a list of words, none empty and each once, got 1"),
+    ({"words": "sofa", "against": "true"}, "against must be a word or a list of words"),
+    ({"words": "sofa", "against": "lamp"}, "'lamp' is no word of"),
+    ({"words": None, "classes": "nowhere.txt"}, "class file nowhere.txt does not exist"),
+    ({"instances.reach": "0"}, "instances.reach must be a number"),
+    ({"features.text": "nowhere.npz"}, "nowhere.npz is no file"),
     ({"against": "sofa"}, "asked for too: leave it out of one"),
     ((put("p.txt", LINE_OF_POSE), {"frame": 1, "pose": "{root}/p.txt"}), "both say from where to draw"),
     ({"frame": 77}, r"no pose of frame=77: choose one from (\d) to \d"),
@@ -209,6 +224,7 @@ OF_SEGMENT = [
     ),
     (put(TRUE_IDS, "5\n9\n"), "has 2 labels and .*: fetch both files of the same mesh"),
     (put(TRUE_IDS, "wall\n"), "is no list of whole numbers, .*: fetch it again"),
+    (put(TRUE_IDS, f"5\n{'9' * 30}\n"), "is no list of whole numbers, .*: fetch it again"),
     (put("truth/classes.txt", "5 wall\n"), "give the class file of this data set"),
     (put("truth/classes.txt", "5 wall\n9 lamp\n"), r"there are wall"),
 ]

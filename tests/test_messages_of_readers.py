@@ -15,6 +15,7 @@ from hydra.errors import InstantiationException
 from PIL import ExifTags, Image
 
 from emgs_jax.config.configure import build, compose, message_of
+from emgs_jax.data.apartment import Apartment
 from emgs_jax.data.bonn import Bonn
 from emgs_jax.data.calibration_files import read_calibration
 from emgs_jax.data.class_file import read_classes
@@ -134,6 +135,15 @@ OF_TUM = [
 ]
 
 
+OF_APARTMENT = [
+    ({"walk": "round"}, "walk must be one of two_laps, figure_of_eight, out_and_back, twin_rooms, corridor"),
+    ({"seed": -1}, "dataset.seed must be 0 or more .* got -1"),
+    ({"num_frames": 0}, "dataset.num_frames 1 or more, got 0, 0, 0"),
+    ({"movers": -1}, "must be 0 or more .dataset.movers likewise. .* got 0, -1"),
+    ({"stride": 0}, "dataset.stride must be at least 1"),
+]
+
+
 OF_BONN = [
     ({"sequence": "rgbd_bonn_balloon"}, r"has: (\w+)$"),
     ({"depth_scale": -1}, "leave the key out for the data set's own"),
@@ -223,6 +233,7 @@ OF_COLMAP = [
     (edit(MODEL, (" 7 img33", " 8 img33")), "of camera 8, which has no line: export the model again"),
     (edit(MODEL, ("img2.png", "img10.png")), "has img10.png twice: export the model again"),
     (edit(MODEL, ("img2.png\n\n", "img2.png\n")), "image has two lines"),
+    (edit(MODEL, ("img10.png\n\n", "IMG 2 (3).png\n")), r"txt:3: expected the points of image IMG 2 \(3\).png"),
     (edit(MODEL, ("\n4 0", "\n4 7")), "images.txt:4: the pose is not finite .*: export the model"),
     (edit(MODEL, ("img10.png", "")), "images.txt:2: expected IMAGE_ID QW.*: export the model again"),
     ((put(CAMERA, FIRST + SECOND), edit(MODEL, (" 7 img33", " 8 img33"))), "2 different cameras"),
@@ -264,6 +275,7 @@ OF_NERFSTUDIO = [
 
 
 SIZE, SQUARE = EUROC_SIZE, [128, 128, 79.5, 59.5]
+FOLDED = (-9, 0, 0, 0), (0, 0, 2, 0), (0, -80, 0, 0)
 
 
 def write_folder(root: Path) -> None:
@@ -314,6 +326,12 @@ OF_IMAGES = [
     (tuple(moved(f"{i}.png", f"{i}.heic") for i in range(3)), "are not read: convert them to jpg or png"),
     (tuple(put(f"{i}.png", b"\x00\x00\x00\x18ftypheic" + bytes(99)) for i in range(3)), "convert it to png or jpg"),
     ({"root": "{root}/0.png"}, "is neither a folder nor a video file"),
+    *(({"intrinsics": [*SQUARE, *lens]}, "the distortion .* leaves . % of the 160x120 image") for lens in FOLDED),
+    ({"intrinsics": ["OPENCV_FISHEYE", *SQUARE, 0, 9, -60, 0]}, "of the model OPENCV_FISHEYE leaves . % of the"),
+    ({"intrinsics": ["OPENCV_FISHEYE", *SQUARE, 0.1]}, "parameters fx, fy, cx, cy, k1, k2, k3, k4, got 5"),
+    ({"intrinsics": ["FISHEYE", *SQUARE[:3], "x"]}, "intrinsics: cy must be a finite number, got 'x'"),
+    ({"intrinsics": [*SQUARE, np.inf, 0, 0, 0]}, r"dataset.intrinsics must be \[fx, fy, cx, cy\]"),
+    ({"intrinsics": 5}, r"dataset.intrinsics must be \[fx, fy, cx, cy\]"),
 ]
 
 
@@ -326,6 +344,7 @@ def write_clip(root: Path) -> None:
 
 OF_CLIP = [
     ({"intrinsics": "exif"}, "a video has no EXIF: give dataset.intrinsics="),
+    ({"intrinsics": [128, 128, 500, 59.5]}, r"principal point outside of the 160x120 images of .*clip\.avi"),
     (put("clip.avi", b""), "clip.avi is empty: copy it again"),
     (put("clip.avi", b"x" * 999), "no video that OpenCV can open: convert it to mp4 .h264. or to images"),
 ]
@@ -717,6 +736,7 @@ OF_STRUCTURE = [
 
 
 TABLES = {
+    "apartment": (lambda root: None, lambda root, **keys: len(Apartment(**keys)), OF_APARTMENT),
     "bonn": (write_tum, frames(Bonn, sequence=TUM), OF_BONN),
     "rosbag": (lambda root: bag()(root), frames(RosBag, sequence="walk", size=[160, 120]), OF_ROSBAG),
     "masks": (write_masked, read_masked, OF_MASKS),

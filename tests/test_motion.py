@@ -84,12 +84,7 @@ CASES = {
         BLOCK,
     ),
     "what hid the place before says nothing": ([with_block(1.0)] * 5 + [WALL] * 2, HERE, {}, BLOCK),
-    "and was seen through twice only": (
-        [WALL] * 2 + [HERE] * 8,
-        HERE,
-        {"masks": [NOTHING] * 2 + [BLOCK] * 8},
-        BLOCK,
-    ),
+    "and was seen through twice only": ([WALL] * 2 + [HERE] * 8, HERE, {"masks": [NOTHING] * 2 + [BLOCK] * 8}, BLOCK),
     "and has stood for all looks": ([HERE] * NUM_LOOKS, HERE, {"masks": [BLOCK] * NUM_LOOKS}, NOTHING),
     "one that is gone": ([HERE] * 5, WALL, {}, NOTHING),
     "a wrong prediction: a line": ([WALL] * 5, with_block(where=COLUMNS == 30), {}, NOTHING),

@@ -6,7 +6,7 @@ from hand_run import run_of
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.mapping.records import FrameRecord
-from tools.nees import band, errors_of_run, nees, pose_errors
+from tools.nees import errors_of_run, nees, pose_errors
 
 COUNT = 4000
 
@@ -45,9 +45,3 @@ def test_a_run_is_compared_from_its_first_frame_on_and_by_its_tracked_frames():
     records = [record("initialization", np.eye(4), np.eye(4), None), record("tracked", off, moved)]
     records += [record("degraded", 10 * off, moved), record("tracked", off, moved)]
     assert nees(*errors_of_run(run_of(records))) == pytest.approx([4.0 / 6.0] * 2)
-
-
-def test_the_band_is_that_of_the_mean_of_so_many_samples():
-    means = np.random.default_rng(1).chisquare(6, (20000, 6)).mean(1) / 6
-    low, high = band(6)
-    assert np.mean((means > low) & (means < high)) == pytest.approx(0.95, abs=0.01) and low < 0.6 and high > 1.5

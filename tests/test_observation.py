@@ -62,30 +62,6 @@ def test_the_smallest_window_is_of_three_pixels(camera, config):
         check_value("normal_radius", 0, fields["normal_radius"])
 
 
-@pytest.mark.parametrize(("step", "is_other_surface"), [(0.04, False), (0.06, True)])
-def test_a_step_separates_surfaces_from_a_fraction_of_the_depth_on(camera, config, step, is_other_surface):
-    """5 % of the inverse depth, here at 4 m; 5 cm or 5 % of a metre would be something else."""
-    near, normal = plane_points(camera, (0, 0, -1), 4.0)
-    far, _ = plane_points(camera, (0, 0, -1), 4.0 / (1 - step))
-    points = np.where((np.arange(32) < 16)[:, None], near, far)
-    normals = normals_from_pointmap(points, EVERY, config().observation)
-    assert (degrees(normals, normal)[5:-5, :16].max() < 0.05) == is_other_surface
-
-
-@pytest.mark.parametrize("direction", [(0, 1), (1, 0)])
-@pytest.mark.parametrize(("radius", "spacing"), [(4, 2), (1, 1)])
-def test_the_window_is_the_configured_taps_and_no_others(camera, config, radius, spacing, direction):
-    """Every second row and column, up to four away: a dent of 2 % at (12, 16) is felt there alone."""
-    words = f"slam.observation.normal_radius={radius}", f"slam.observation.normal_spacing={spacing}"
-    settings = config(*words).observation
-    points, _ = plane_points(camera, (0.05, 0.1, -1), 1.5)
-    dented = points.copy()
-    dented[12, 16] *= 1.02
-    turned = degrees(*(normals_from_pointmap(x, EVERY, settings) for x in (points, dented)))
-    felt = {n for n in range(-7, 8) if turned[12 - n * direction[0], 16 - n * direction[1]] > 0.1}
-    assert felt | {0} == set(range(-radius, radius + 1, spacing))
-
-
 @pytest.mark.parametrize(("radius", "spacing"), [(4, 2), (1, 1)])
 def test_of_noisy_depths_the_normal_is_that_of_least_squares_over_the_window(camera, config, radius, spacing):
     """A slanted plane with errors of 1 % and holes, at the border, too; a step is 3 %, which some neighbours exceed."""
@@ -115,17 +91,6 @@ def test_a_normal_needs_more_than_a_fifth_of_its_window(camera, config, count, h
         valid[row, column] = True
     normals = normals_from_pointmap(points, valid, settings)
     assert (np.linalg.norm(normals[12, 16]) > 0.99) == has_normal
-
-
-@pytest.mark.parametrize("poison", [0.0, 1e6])
-def test_holes_have_no_normal_and_do_not_touch_their_surroundings(camera, config, poison):
-    points, truth = plane_points(camera, (0, 0.1, -1), 1.5)
-    valid = EVERY.copy()
-    valid[10:13, 8:20] = False
-    poisoned = np.where(valid[..., None], points, np.float32(poison))
-    normals = normals_from_pointmap(poisoned, valid, config().observation)
-    np.testing.assert_array_equal(normals[~valid], 0)
-    assert degrees(normals[valid], truth).max() < 0.05
 
 
 def test_pixels_in_one_row_alone_determine_no_normal(camera, config):
@@ -236,17 +201,6 @@ def test_a_pixel_that_is_no_measurement_is_invalid_finite_and_changes_no_other(c
     assert all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(o))
     np.testing.assert_array_equal(o.points, clean.points)
     np.testing.assert_array_equal(o.normals, clean.normals)
-
-
-def test_a_masked_pixel_that_is_nan_everywhere_still_gives_finite_rows(camera, config):
-    points, colors, features, confidence, mask = example(camera)
-    for image in (points, colors, features, confidence):
-        image[3, 4] = np.nan
-    mask[3, 4] = False
-    o = observe(points, colors, features, confidence, mask, config().observation)
-    assert not o.valid[3 * 32 + 4]
-    for name in ("points", "normals", "features", "colors", "confidence"):
-        assert np.isfinite(getattr(o, name)).all(), name
 
 
 def test_a_transform_scales_about_the_source_then_moves_points_and_turns_normals(camera):

@@ -7,7 +7,6 @@ rows.
 import os
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 import reference
@@ -16,13 +15,8 @@ from compiled_rows import largest_difference, random_problem
 from scipy.spatial import cKDTree
 
 from emgs_jax.em import em_update
-from emgs_jax.localization import CoarsePose, localize_fine
 from emgs_jax.observation import observe
-from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.neighbours import knn
-from emgs_jax.registration.pose_estimate import PoseEstimate
-from emgs_jax.registration.pose_noise import no_repeats
-from emgs_jax.render.composite import render
 
 pytestmark = pytest.mark.slow
 AS_USERS_HAVE_IT = {"xla_backend_optimization_level": 3}
@@ -69,22 +63,6 @@ def test_an_update_is_that_of_equations_2_to_4():
     assert len(apart) > 100 and np.quantile(apart, 0.98) < 1e-3
 
 
-@pytest.mark.weekly
-def test_an_image_is_that_of_every_gaussian_at_every_pixel(camera):
-    config = sc.slam_config().refinement.render
-    g = sc.random_gaussians(60, 2, low=(-0.8, -0.6, 1.5), high=(0.8, 0.6, 3))
-    T = sc.pose((0.05, -0.1, 0.05), (0.05, -0.05, 0.1))
-    image = optimised(lambda g, T, config: render(g, g.colors, T, camera, config), g, T, config)
-    colors = np.asarray(g.colors, float)
-    values, alpha, depth, _ = reference.render(sc.as_numpy(g), colors, sc.matrix_of(T), camera, config)
-    assert image.overflow == 0 and (alpha > 0.3).mean() > 0.2
-    wrong = np.abs(image.alpha - alpha) > 1e-4  # at a splat's edge, whose weight is .01
-    assert wrong.mean() < 0.02 and np.abs(image.alpha - alpha).max() < 0.02
-    np.testing.assert_allclose(image.values[~wrong], values[~wrong], atol=1e-4)
-    both = ~wrong & (np.abs(alpha - float(config.min_alpha)) > 1e-3)
-    np.testing.assert_allclose(image.depth[both], depth[both], atol=2e-3)  # m; slopes in float32
-
-
 def test_normals_are_those_of_least_squares_over_the_window():
     """A slanted plane with errors of 1 %, and holes."""
     config = sc.slam_config("slam.observation.normal_radius=2", "slam.observation.normal_spacing=2").observation
@@ -103,28 +81,3 @@ def test_normals_are_those_of_least_squares_over_the_window():
         expected = reference.normal_of_window(points.astype(float), valid, row, column, taps, 0.03)
         # Sums of a window relative to its pixel in float32; .1 rad wide, so 1e-6 of them is 1e-5 rad.
         assert normals[row, column] @ expected > np.cos(np.radians(0.05))
-
-
-@pytest.mark.weekly  # compiles for half a minute
-def test_the_fine_step_finds_the_pose_in_a_closed_room():
-    """From 5 cm and 2 degrees, among discs on the walls where another view has its pixels."""
-    view, T = Camera([60.0, 66.0], [39.5, 30.25], 80, 64), sc.path_pose(3)
-    config = sc.slam_config("slam.localization.icp.num_points=4800").localization
-    gates = {"min_inlier_fraction": 0.0, "max_residual": np.inf, "max_step": np.inf, "max_step_rad": np.inf}
-    config = sc.changed(config, **gates, **{"icp.prior_information": 0.0, "icp.max_mahalanobis_sq": 25.0})
-    other, current = sc.path_pose(2), sc.observe_room(T, view)
-    seen, matrix = sc.observe_room(other, view), sc.matrix_of(other)
-    rows = np.random.default_rng(0).permutation(80 * 64)[:1500]
-    means, normals = (np.asarray(x, float)[rows] for x in (seen.points, seen.normals))
-    walls = sc.flat_gaussians(means @ matrix[:3, :3].T + matrix[:3, 3], 0.03)
-    normals = normals @ matrix[:3, :3].T
-    across = normals[:, :, None] * normals[:, None]
-    covs = 0.03**2 * (np.eye(3) - across) + 0.003**2 * across
-    walls = sc.replace(walls, normals=normals, covs=covs, colors=np.asarray(seen.colors)[rows])
-    start = sc.product(T, sc.pose((0.01, -0.02, 0.02), (0.03, 0.02, -0.03)))
-    covariance = sc.device(np.diag([1e-3] * 6 + [1e-4]))
-    belief = PoseEstimate(covariance, *map(sc.device, (0.01, 0.0, 1.0)), no_repeats(), jnp.asarray(False))
-    coarse = CoarsePose(start, start, *map(sc.device, (1.0, 0.02, 2.0, 0.01)), belief, *[jnp.asarray(True)] * 4)
-    found, aligned, info = optimised(localize_fine, current, walls, coarse, config)
-    assert info.is_tracked and info.icp.num_inliers > 2500 and aligned.valid.all()
-    assert max(sc.pose_error(found, T)) < 0.01 < 0.02 < min(sc.pose_error(start, T))

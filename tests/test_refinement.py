@@ -52,21 +52,6 @@ def map_of(gaussians: Gaussians) -> GaussianMap:
     return sc.rows_of(sc.fresh_map(gaussians), slice(None))
 
 
-def test_a_candidate_on_the_mapped_surface_merges_by_equations_5_and_6(settings, camera):
-    """One map Gaussian, one candidate: ω = cos, γ = ω / (1 + ω) from α = 1."""
-    old, new = discs((0, 0, 2.0), std=0.3), discs((0.02, 0.01, 2.01), std=0.3, feature=(0.8, 0.6), color=0.9)
-    merged, fresh, info = run(settings, camera, new, old)
-    assert (info.num_candidates, info.num_merged, info.num_fresh) == (1, 1, 0) and not fresh.valid.any()
-    gamma = 0.8 / 1.8
-    g = merged.gaussians
-    np.testing.assert_allclose(g.means[0], np.array([0.02, 0.01, 0]) * gamma + [0, 0, 2 + 0.01 * gamma], atol=1e-6)
-    np.testing.assert_allclose(g.colors[0], 0.5 + 0.4 * gamma, atol=1e-6)
-    expected = (1 - gamma) * np.asarray(old.covs)[0] + gamma * np.asarray(new.covs)[0]
-    np.testing.assert_allclose(g.covs[0], expected, atol=1e-6)
-    np.testing.assert_array_equal(g.features, old.features)
-    np.testing.assert_allclose(merged.weight, gamma, atol=1e-6)
-
-
 def test_evidence_of_a_merged_candidate_is_shared_out_and_none_is_lost(settings, camera):
     """Two equal map Gaussians: each gets half of the candidate's evidence; what is not merged gives none."""
     old = discs([(0.02, 0, 2.0), (-0.02, 0, 2.0)], std=0.3)
@@ -131,42 +116,6 @@ def test_a_refinement_equals_equations_5_and_6_one_candidate_at_a_time(settings,
     sc.assert_same(sc.rows_of(merged, others), sc.rows_of(sc.fresh_map(old, weight), others))
 
 
-def test_the_margins_say_how_far_in_front_and_behind_may_still_merge(settings, camera):
-    for z, front, back, expected in [
-        (1.9, 0.1, np.inf, 1),  # 5 % in front
-        (1.9, 0.04, np.inf, 0),
-        (2.1, 0.0, np.inf, 1),  # as printed: anything behind
-        (2.1, 0.0, 0.06, 1),
-        (2.1, 0.0, 0.04, 0),
-    ]:
-        config = sc.changed(settings, front_margin=front, back_margin=back)
-        _, fresh, info = run(config, camera, discs((0.02, 0.0, z)))
-        assert info.num_merged == expected and fresh.valid.sum() == 1 - expected, (z, front, back)
-
-
-def test_candidates_beside_a_depth_edge_do_not_move_what_is_before_them(settings, camera):
-    """A front at 1 m that ends at x = 0, a wall at 3 m behind it, and exact candidates of the wall beside the edge.
-
-    The depth at a candidate's own pixel is the wall's, but its nearest splats are those of the front: as printed they
-    merge.
-    """
-    front = [(x, y, 1.0) for x in np.arange(-0.6, 0.0, 0.1) for y in np.arange(-0.4, 0.41, 0.1)]
-    wall = [(x, y, 3.0) for x in np.arange(0.1, 1.6, 0.3) for y in np.arange(-1.2, 1.21, 0.3)]
-    old = sc.join(discs(front, 0.05), discs(wall, 0.15))
-    new = discs([(x, 0.0, 3.0) for x in (0.1, 0.2, 0.3, 0.4, 0.5)], std=0.1)
-    is_front = np.arange(len(front) + len(wall)) < len(front)
-
-    def moved(config):
-        merged, _, info = run(config, camera, new, old)
-        return np.linalg.norm(merged.gaussians.means - old.means, axis=1)[is_front].max(), int(info.num_merged)
-
-    printed, _ = moved(sc.at(settings, "max_mahalanobis_sq_2d", 9.0))
-    assert printed > 0.1
-    paired = sc.changed(settings, max_mahalanobis_sq_2d=9.0, depth_condition=1.0, front_margin=0.1, back_margin=0.1)
-    distance, num_merged = moved(paired)
-    assert distance == 0 and num_merged > 0
-
-
 @pytest.mark.parametrize("missing", ["candidate", "map"])
 def test_where_a_feature_is_missing_it_says_nothing(settings, camera, missing):
     """As if both were the same: unlabelled pixels are no other surface."""
@@ -181,16 +130,6 @@ def test_where_a_feature_is_missing_it_says_nothing(settings, camera, missing):
     np.testing.assert_array_equal(merged.gaussians.means, expected.gaussians.means)
 
 
-def test_the_distance_gate_is_on_the_squared_distance_under_both_covariances(settings, camera):
-    """0.4 m apart at 2 m: 4 pixels in x; each splat's variance is 2 · (20 · .15 / 2)² + .3 pixels²."""
-    old, new = discs((0, 0, 2.0), std=0.15), discs((0.4, 0, 2.0), std=0.15)
-    wide = sc.changed(settings, **{"render.min_alpha": 1e-3, "render.radius": 10.0})  # so that the map has depth there
-    distance_sq = 4**2 / (2 * (2 * 1.5**2 + 0.3))
-    for factor, expected in ((1.01, 1), (0.99, 0)):
-        _, _, info = run(sc.at(wide, "max_mahalanobis_sq_2d", factor * distance_sq), camera, new, old)
-        assert info.num_merged == expected
-
-
 @pytest.mark.parametrize("feature, cosine", [((0.8, 0.6), 0.8), ((-1.0, 0.0), 0.0)])
 def test_the_weight_of_the_cosine_says_how_much_features_decide(settings, camera, feature, cosine):
     """One Gaussian, one candidate: what α = 1 gains is ω, of which 1 - w is there whatever the features are."""
@@ -203,33 +142,10 @@ def test_the_weight_of_the_cosine_says_how_much_features_decide(settings, camera
         assert info.num_merged == (omega > 0)
 
 
-def test_an_occluded_map_gaussian_is_not_matched(settings, camera):
-    behind = discs(GRID + [(0.02, 0.02, 3.0)])
-    merged, _, info = run(settings, camera, discs((0.02, 0.02, 2.0)), behind)
-    assert info.num_merged == 1
-    sc.assert_same(sc.rows_of(merged, -1), sc.rows_of(sc.fresh_map(behind), -1))
-
-
-def test_a_candidate_that_is_too_wide_is_dropped(settings, camera):
-    config = sc.at(settings, "max_splat_std", 3.0)
-    merged, fresh, info = run(config, camera, discs([(0.02, 0, 1.0), (0.5, 0.3, 1.0)], std=0.5))  # 10 pixels
-    assert info.num_merged == 0 and not fresh.valid.any()
-    sc.assert_same(merged, map_of(discs(GRID)))
-
-
 def random_candidates(count=40, seed=0):
     rng = np.random.default_rng(seed)
     means = rng.uniform([-1.2, -0.9, 1.8], [1.2, 0.9, 2.3], (count, 3))
     return sc.replace(discs(means, std=0.1), valid=np.arange(count) % 5 > 0)
-
-
-def test_every_valid_candidate_is_merged_or_fresh(settings, camera):
-    candidates = random_candidates()
-    _, fresh, info = run(settings, camera, candidates)
-    assert info.num_candidates == 32 == info.num_merged + info.num_fresh
-    assert info.num_merged > 0 and info.num_fresh > 0 and fresh.valid.sum() == info.num_fresh
-    assert not fresh.valid[::5].any()
-    sc.assert_same(sc.replace(fresh, valid=candidates.valid), candidates)
 
 
 def test_without_candidates_the_map_stays_bit_for_bit(settings, camera):
@@ -244,17 +160,6 @@ def test_an_empty_map_makes_every_candidate_fresh(settings, camera):
     merged, _, info = run(settings, camera, random_candidates(), empty)
     assert info.num_fresh == 32
     sc.assert_same(merged, map_of(empty))
-
-
-@pytest.mark.parametrize("poison", [1e6, np.nan])
-def test_invalid_candidates_and_map_rows_change_nothing(settings, camera, poison):
-    seen, candidates = sc.replace(discs(GRID), valid=np.arange(25) % 6 > 0), random_candidates()
-    known, new = np.asarray(seen.valid), np.asarray(candidates.valid)
-    clean = run(settings, camera, candidates, seen)
-    wild = run(settings, camera, sc.poisoned(candidates, new, poison), sc.poisoned(seen, known, poison))
-    sc.assert_same(wild[2], clean[2])
-    sc.assert_same(sc.rows_of(wild[0], known), sc.rows_of(clean[0], known))
-    sc.assert_same(sc.rows_of(wild[1], clean[1].valid), sc.rows_of(clean[1], clean[1].valid))
 
 
 def splats(means, is_valid) -> Splats:

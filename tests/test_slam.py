@@ -6,9 +6,8 @@ import jax
 import jaxlie
 import numpy as np
 import pytest
-import reference
 import scene as sc
-from scene import FULL, ROOM, WHOLE, exact, noisy, noisy_prediction
+from scene import FULL, ROOM, WHOLE, exact, noisy_prediction
 
 from emgs_jax import slam
 from emgs_jax.localization import COARSE
@@ -114,23 +113,6 @@ def small_steps(camera, num_frames, slab_frames=()):
             prediction = eqx.tree_at(lambda p: p.current.points, prediction, sc.device(points))
         before = i
         yield prediction
-
-
-def test_a_slab_that_two_frames_show_is_gone_within_twenty_and_the_wall_behind_it_stays(state, camera, settings):
-    """Beside the same steps without it. Gaussians of this room stand some 20 cm apart, the slab a metre before it."""
-
-    def means_of(state):
-        return np.asarray(state.map.gaussians.means)[np.asarray(state.map.gaussians.valid)]
-
-    clean, state_with, counts = state, state, []
-    for plain, seen in zip(small_steps(camera, 22), small_steps(camera, 22, slab_frames=(0, 1)), strict=True):
-        clean, _ = step(clean, plain, FULL, settings)
-        state_with, info = step(state_with, seen, FULL, settings)
-        assert info.localization.is_tracked
-        apart = np.linalg.norm(means_of(state_with)[:, None] - means_of(clean), axis=-1)
-        counts.append(int((apart.min(1) > 0.4).sum()))
-    assert counts[1] >= 5 and counts[-1] == 0
-    assert (apart.min(0) < 0.25).mean() >= 0.99
 
 
 def with_one_in_the_way(map, row, T, seen, existence):
@@ -398,30 +380,6 @@ def test_a_step_after_a_lost_frame_is_tracked_again(state, settings):
     assert sc.pose_error(info.T_world_camera, sc.path_pose(FRAME + 1))[0] < 0.07
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "law",
-    [
-        {"depth_noise": 0.03, "scale_noise": 0.0, "pose_noise": (1e-4, 1e-4)},  # structure from motion
-        {"depth_noise": 0.002, "scale_noise": 0.0, "pose_noise": (0.03, 0.015)},  # a depth camera in the hand
-    ],
-)
-def test_poses_are_trusted_as_far_as_they_repeat_whatever_depths_do(window, camera, law):
-    """By the law of the depths, as printed, the path of either prior is worse: nothing ties the two."""
-    draws = [np.random.default_rng(seed) for seed in (0, 1)]  # of one draw alone either path may be lucky
-    walks = [[window, *(noisy_prediction(FRAME + i, camera, rng, **law) for i in range(15))] for rng in draws]
-    chosen = sc.at(sc.slam_config(*WHOLE), "localization.max_residual", 1.0)
-
-    def error(shared):
-        config = sc.at(chosen, "localization.pose_shared", shared)
-        paths = [[info.T_world_camera for info in run(given, config)[1]] for given in walks]
-        ends = [sc.pose_error(T, sc.path_pose(FRAME + i))[0] for path in paths for i, T in enumerate(path)]
-        return np.sqrt(np.mean(np.square(ends)))
-
-    said, by_depths = error(0.75), error(1.0)
-    assert said < 0.7 * by_depths
-
-
 def test_free_rows_of_the_map_and_invalid_points_change_nothing(state, settings):
     seen = np.arange(768) % 6 > 0
     views = lambda p: (p.current.valid, p.previous.valid)  # noqa: E731
@@ -451,30 +409,6 @@ def predictions(window, count):
     return [window, *(exact(FRAME + i, has_newest=i < count - 1) for i in range(count))]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "capacities",
-    [
-        (ROOM // 2, 256),
-        pytest.param((64, 64), marks=pytest.mark.weekly),
-    ],  # each new size of the submap compiles the whole step
-)
-def test_growing_on_the_way_gives_the_same_map_as_starting_large(window, capacities):
-    def mapped(capacity, submap):
-        room = f"slam.submap.map_capacity={capacity}", f"slam.submap.submap_capacity={submap}"
-        return run(predictions(window, 3), lenient(*room))
-
-    small, infos = mapped(*capacities)
-    large, large_infos = mapped(ROOM, 256)
-    count = int(np.sum(large.map.gaussians.valid))
-    assert count > 100 and len(infos) == len(large_infos) == 3
-    assert small.map.weight.shape == (2 * capacities[0],)
-    assert all(int(i.overflow.map) == int(i.overflow.submap) == 0 for i in infos)
-    for a, b in zip(jax.tree.leaves(small.map), jax.tree.leaves(large.map), strict=True):
-        # Other shapes sum in another order.
-        np.testing.assert_allclose(np.asarray(a)[:count], np.asarray(b)[:count], atol=1e-4)
-
-
 @pytest.mark.parametrize("initialization", ["merged", "incremental"])
 def test_a_run_follows_the_exact_path_reports_every_step_and_repeats_bit_for_bit(window, initialization):
     chosen = sc.slam_config(*WHOLE, f"slam.initialization={initialization}")
@@ -490,33 +424,6 @@ def test_a_run_follows_the_exact_path_reports_every_step_and_repeats_bit_for_bit
     assert max(sc.pose_error(T, t)[0] for T, t in zip(found, truth, strict=True)) < 0.02
     assert min(sc.pose_error(T, t)[0] for T, t in zip(found[1:], truth[:-1], strict=True)) > 0.03
     assert max(sc.pose_error(results[0][0].T_world_previous, found[-1])) < 1e-6
-
-
-def off_walls(points):
-    """Distance of world points to the nearest wall of the room."""
-    points = np.asarray(points, float)
-    return np.minimum(np.abs(points - reference.ROOM_LOW), np.abs(points - reference.ROOM_HIGH)).min(axis=-1)
-
-
-@pytest.mark.slow
-def test_a_map_of_noisy_predictions_is_more_accurate_than_their_points(camera):
-    """Oracle: the room's walls, and the camera's path. The prior's points lie where its own poses put them."""
-    chosen = sc.changed(sc.slam_config(*WHOLE, "slam.em.average.gain=count"), **LENIENT)
-    poses = [sc.path_pose(i) for i in range(FRAME)]
-    ratios = []
-    for seed in range(6):  # few frames of a small world: one by itself says little
-        rng, count = np.random.default_rng(seed), 8
-        views = [noisy(sc.observe_room(T, camera, num_features=2), camera, rng, 0.02) for T in poses]
-        sequence = [noisy_prediction(FRAME + i, camera, rng) for i in range(count)]
-        final, infos = run([sc.first_window(sc.stack(views), sc.stack_poses(poses)), *sequence], chosen)
-        assert all(i.localization.is_tracked for i in infos)
-        raw_poses = [jaxlie.SE3(np.asarray(p.T_world_views.wxyz_xyz)[1]) for p in sequence]
-        pairs = [*zip(poses, views, strict=True), *zip(raw_poses, (p.current for p in sequence), strict=True)]
-        raw = np.concatenate([off_walls(sc.moved_points(T, o).points) for T, o in pairs])
-        ours = off_walls(final.map.gaussians.means)[np.asarray(final.map.gaussians.valid)]
-        ratios.append([np.median(ours) / np.median(raw), np.quantile(ours, 0.9) / np.quantile(raw, 0.9)])
-    # Twelve frames see a wall, with errors that are independent but for the path's: a third is the most to hope for.
-    assert np.all(np.mean(ratios, axis=0) < 0.7), ratios
 
 
 SURE = {"pose_covariance": np.tile(1e-8 * np.eye(6), (2, 1, 1)), "scale_std": np.float32(1e-4)}
@@ -539,19 +446,6 @@ def test_a_field_of_the_first_frames_fades_from_the_map(camera):
     sizes = [float(np.abs(i.localization.icp.field.nodes).max()) for i in infos]
     assert 0.06 < sizes[0] < 0.1, "what the map differs from the frame"
     assert sizes == sorted(sizes, reverse=True) and sizes[-1] < 0.5 * sizes[0], "3 of 11 frames are wrong"
-
-
-def test_a_map_that_no_frame_has_made_becomes_what_the_frame_shows_its_field_included(state, settings, camera):
-    """1 / (W + 1) of what they differ is the map's error, with W before this frame: of a map without weight all."""
-    now = eqx.tree_at(lambda s: s.map.weight, state, sc.device(np.zeros(ROOM)))
-    sizes = []
-    for i in range(2):
-        given = sc.replace(exact(FRAME + i), **SURE)
-        given = eqx.tree_at(lambda p: p.current, given, sloping(given.current, camera))
-        now, info = step(now, given, FULL, settings)
-        assert info.localization.is_tracked
-        sizes.append(float(np.abs(info.localization.icp.field.nodes).max()))
-    assert sizes[0] > 0.06 and sizes[1] < 0.3 * sizes[0]
 
 
 # What a step is compiled for.
@@ -591,25 +485,6 @@ def test_no_number_and_no_reading_of_the_config_traces_or_compiles_anything(stat
         before = len(events)
         jax.block_until_ready(step(state, prediction, FULL, config))
         assert not [name for name in events[before:] if "trace" in name or "compile" in name], number
-
-
-def products_in(jaxpr):
-    """The parameters of all matrix products of a program."""
-    for equation in jaxpr.eqns:
-        if equation.primitive.name == "dot_general":
-            yield equation.params
-        for inner in jax.tree.leaves(equation.params, is_leaf=lambda x: hasattr(x, "eqns") or hasattr(x, "jaxpr")):
-            inner = getattr(inner, "jaxpr", inner)
-            if hasattr(inner, "eqns"):
-                yield from products_in(inner)
-
-
-def test_every_matrix_product_of_a_step_is_in_full_float32(state, stepped, settings):
-    """By default JAX lets a GPU round the factors to ten bits, which no test on a CPU would notice."""
-    program = jax.make_jaxpr(step)(state, exact(FRAME), FULL, settings)
-    found = [params["precision"] for params in products_in(program.jaxpr)]
-    highest = jax.lax.Precision.HIGHEST
-    assert len(found) > 20 and all(precision == (highest, highest) for precision in found)
 
 
 # Room, and what a run begins with.
@@ -688,8 +563,3 @@ def test_a_window_opens_whole_or_view_by_view(window):
     replaced = eqx.tree_at(lambda w: w.T_world_views, window, jaxlie.SE3(sc.device(poses)))
     with pytest.raises(ValueError, match="no pose"):
         opening(replaced, sc.slam_config("slam.initialization=merged"))
-
-
-def test_an_unknown_initialisation_is_refused():
-    with pytest.raises(Exception, match="one of merged, incremental.*'random'"):
-        sc.slam_config("slam.initialization=random")

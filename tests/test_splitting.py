@@ -5,10 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scene import assert_same, at, device, explained, fresh_map, on_host, random_gaussians, replace, rows_of, shares_of
+from scene import assert_same, device, explained, fresh_map, on_host, random_gaussians, replace, rows_of
 
-from emgs_jax.em import em_update, owners
-from emgs_jax.gaussian_map import GaussianMap, insert
+from emgs_jax.em import owners
+from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.observation import Observation
 from emgs_jax.splitting import halves, is_too_coarse, split
@@ -165,36 +165,3 @@ def test_no_more_than_max_splits_and_the_rest_in_the_next_frames(config):
     assert second.gaussians.valid.sum() == 1
     np.testing.assert_array_equal(cut.gaussians.means[1], both.gaussians.means[1])
     assert (cut.gaussians.means[0] != both.gaussians.means[0]).any()
-
-
-@on_host
-def seen_again(map, points, noise, em_config, splitting):
-    """One frame: what it is fused into and by which shares, and the map with halves in free rows."""
-    fused, step, _ = em_update(map, points, noise, em_config)
-    map, second = split(fused, points, noise, owners(step, 96), SPACING, splitting)
-    map, _, overflow = insert(map, second)
-    return fused, step, map, overflow
-
-
-def frames_of_a_checkerboard(config, splitting, num_frames=12):
-    """A coarse Gaussian of a board of 4 × 2 squares, then near views: the map's colour error at the board's points."""
-    map = rows_of(one_disc(weight=1.0), np.minimum(np.arange(96), 1))
-    points = points_of(map, count=1200)
-    squares = np.floor((np.asarray(points.points) - map.gaussians.means[0])[:, :2] / 0.15).astype(int).sum(-1) % 2
-    points = replace(points, colors=np.broadcast_to(0.2 + 0.6 * squares[:, None], (1200, 3)))
-    noise, counts = np.zeros((1200, 3), np.float32), []
-    for _ in range(num_frames + 1):
-        fused, step, map, overflow = seen_again(map, points, noise, config.em, splitting)
-        assert overflow == 0
-        counts.append(int(map.gaussians.valid.sum()))
-    shown = shares_of(step, len(fused.weight)) @ fused.gaussians.colors
-    return counts, float(np.mean(np.abs(shown - points.colors)[step.is_fused]))
-
-
-@pytest.mark.slow
-def test_a_checkerboard_seen_near_becomes_its_squares_and_then_no_more(config):
-    whole, settings = config("slam.em.num_neighbours=8"), config().splitting
-    _, blurred = frames_of_a_checkerboard(whole, at(settings, "min_points", 1e6))  # never near enough
-    counts, sharp = frames_of_a_checkerboard(whole, settings)
-    assert sharp < 0.6 * blurred
-    assert counts[-1] == counts[-4] and 6 <= counts[-1] <= 2 * 1200 / (settings.min_points * SPACING)

@@ -14,13 +14,12 @@ import scene as sc
 from verbs import CAMERA, CONFIG, DENSIFY, ROWS, graph_of, map_of
 
 from emgs_jax import em, existence, gaussians, splitting, surface_extrapolation
-from emgs_jax.evaluation.loops import double_wall_share
 from emgs_jax.initialization import initialize
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.pose_graph import deform
 from emgs_jax.pose_graph.optimize import PoseGraphConfig, optimize
 from emgs_jax.refinement import refine
-from emgs_jax.render import composite, densify
+from emgs_jax.render import densify
 
 pytestmark = pytest.mark.slow
 VIEW = sc.path_pose(2)
@@ -73,7 +72,6 @@ def look(map, view, T, config):
 
 
 refined = sc.on_host(lambda m, g, T, config: refine(m, g, T, CAMERA, config.refinement)[:2])
-rendered = sc.on_host(lambda g, T: composite.render(g, g.colors, T, CAMERA, CONFIG.refinement.render))
 densified = sc.on_host(lambda g, T, config: densify.densify(g, T, CAMERA, config))
 moved = sc.on_host(lambda m, a, b, std: deform.deform(m, a, b, std, deform.DeformConfig(4, 40.0)))
 started = sc.on_host(lambda views, T, config: initialize(views, T, CAMERA, 1, config.fit)[0])
@@ -112,10 +110,6 @@ def extrapolation(s):
     return continued(lengths(seen(2), s), lengths(map_of(0), s), ROWS, pose(VIEW, s), config(s))
 
 
-def rendering(s):
-    return rendered(lengths(sc.random_gaussians(32, 0, 2), s), pose(sc.pose(), s))
-
-
 def densification(s):
     return densified(lengths(sc.random_gaussians(32, 0, 2), s), pose(sc.pose(), s), sc.at(DENSIFY, "min_std", 0.05 * s))
 
@@ -134,15 +128,8 @@ def pose_graph(s):
     return nodes, np.float32([info.cost, info.num_iterations])
 
 
-def double_walls(s):
-    g = lengths(sc.random_gaussians(400, 0, high=(1, 1, 1.4)), s)
-    arrays = (np.asarray(x, float) for x in (g.means, g.normals, g.covs))
-    arrays = tuple(arrays)
-    return np.float32([double_wall_share(*arrays, None), double_wall_share(*arrays, s)])
-
-
-STAGES = initialization, colour_gradients, fusion, refinement, looks, extrapolation, rendering, densification
-STAGES += deformation, pose_graph, double_walls
+STAGES = initialization, colour_gradients, fusion, refinement, looks, extrapolation, densification
+STAGES += deformation, pose_graph
 
 
 @pytest.mark.parametrize("stage", STAGES, ids=lambda stage: stage.__name__)

@@ -8,7 +8,6 @@ import jax.numpy as jnp
 import jaxlie
 import numpy as np
 import pytest
-from omegaconf import OmegaConf
 from scene import assert_same, device, random_gaussians, random_observation
 
 from emgs_jax import back_end, load_config
@@ -347,11 +346,6 @@ def test_a_graph_for_other_solvers_costs_what_ours_does_and_has_the_nodes_of_the
 def random_steps(std: float) -> np.ndarray:
     steps = np.random.default_rng(0).normal(0, std, (COUNT, 6))
     return np.asarray(jaxlie.SE3.exp(jnp.asarray(steps, jnp.float32)).as_matrix(), np.float64)
-
-
-def test_without_a_graph_there_is_no_back_end():
-    assert load_config().graph is None
-    assert OmegaConf.create(load_config().settings).graph == {}
 
 
 def told_again(poses: np.ndarray, off: float = 0.0):

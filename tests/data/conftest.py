@@ -52,7 +52,6 @@ seven_scenes_root, tum_root, replica_root, images_root = map(
     copy_of, (write_seven_scenes, write_tum, write_replica, write_images)
 )
 euroc_root, kitti_root = map(copy_of, (write_euroc, write_kitti))
-bonn_root = tum_root  # the same layout
 
 
 @pytest.fixture

@@ -194,18 +194,3 @@ def test_fewer_frames_and_a_stride_go_the_same_way():
     assert len(few) == 3
     np.testing.assert_allclose([few.pose(0), few.pose(2)], path[[0, -1]], atol=1e-9)
     np.testing.assert_array_equal([part.pose(index) for index in range(len(part))], path[::140])
-
-
-@pytest.mark.parametrize(
-    "setting, message",
-    [
-        ({"walk": "round"}, "walk must be one of two_laps, figure_of_eight, out_and_back, twin_rooms, corridor"),
-        ({"seed": -1}, "dataset.seed must be 0 or more .* got -1"),
-        ({"num_frames": 0}, "dataset.num_frames 1 or more, got 0, 0, 0"),
-        ({"movers": -1}, "must be 0 or more .dataset.movers likewise. .* got 0, -1"),
-        ({"stride": 0}, "dataset.stride must be at least 1"),
-    ],
-)
-def test_a_bad_setting_names_its_key_and_what_to_give(setting, message):
-    with pytest.raises(ValueError, match=message):
-        Apartment(**setting)

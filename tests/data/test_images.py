@@ -51,13 +51,6 @@ def test_names_without_ascending_numbers_get_their_position_as_time(images_root)
     np.testing.assert_allclose(load(images_root, size=(80, 30)).intrinsics, (64, 32, 39.5, 14.5))  # another aspect
 
 
-def test_a_camera_that_does_not_fit_names_the_video(tmp_path):
-    path = tmp_path / "clip.mp4"
-    write_video(path)  # a damaged header gave a video of 32x4, and the message named no file
-    with pytest.raises(ValueError, match=r"principal point outside of the 160x120 images of .*clip\.mp4"):
-        load(path, intrinsics=(128.0, 128.0, 500.0, 59.5))
-
-
 def test_a_broken_first_image_and_one_of_another_size_are_bad_frames_and_hide_no_other(images_root):
     (images_root / "img2.png").write_bytes(b"")
     cv2.imwrite(str(images_root / "img44.png"), color_image(0, (80, 60)))

@@ -17,7 +17,6 @@ from emgs_jax.data.undistortion import undistortion
 
 SIZE, CAMERA = (160, 120), (128.0, 125.0, 78.0, 61.0)
 LENSES = {"barrel": (-0.25, 0.05, 0.002, -0.001), "pincushion": (0.15, 0.02, -0.001, 0.002, 0.01)}
-FOLDED = (-9, 0, 0, 0), (0, 0, 2, 0), (0, -80, 0, 0)
 DOT = np.array([[30.0, 25.0], [80.0, 60.0], [131.0, 96.0]])
 TUM = "rgbd_dataset_freiburg3_plane"
 
@@ -69,22 +68,6 @@ def test_a_point_is_where_opencv_undistorts_it_to_and_no_pixel_is_invented(lens,
     assert none.intrinsics == straight.intrinsics == pytest.approx(CAMERA)
     np.testing.assert_array_equal(none[0].image, straight[0].image)
     assert none.fingerprint() == straight.fingerprint()
-
-
-@pytest.mark.parametrize(
-    "given, message",
-    [
-        *(((*CAMERA, *lens), "the distortion .* leaves . % of the 160x120 image") for lens in FOLDED),
-        (["OPENCV_FISHEYE", *CAMERA, 0, 9, -60, 0], "the distortion .* of the model OPENCV_FISHEYE leaves . % of the"),
-        ([*CAMERA, np.inf, 0, 0, 0], r"must be \[fx, fy, cx, cy\]"),
-        (5, r"must be \[fx, fy, cx, cy\]"),
-        (["OPENCV_FISHEYE", *CAMERA, 0.1], "OPENCV_FISHEYE has the parameters fx, fy, cx, cy, k1, k2, k3, k4, got 5"),
-        (["FISHEYE", *CAMERA[:3], "x"], "cy must be a finite number, got 'x'"),
-    ],
-)
-def test_numbers_that_are_no_camera_name_the_key(given, message, tmp_path):
-    with pytest.raises(ValueError, match=f"dataset.intrinsics:? {message}"):
-        load(folder_of(tmp_path), given)
 
 
 def test_a_file_gives_the_camera_of_every_data_set_and_says_so(tum_root, seven_scenes_root, tmp_path):

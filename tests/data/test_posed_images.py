@@ -9,7 +9,6 @@ from PIL import ExifTags, Image
 from written_scene import color_image, scene_pose
 
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.data.colmap_model import load_colmap
 from emgs_jax.data.images import Images
 from emgs_jax.data.posed_images import Colmap, Nerfstudio
 from emgs_jax.data.readable import ReadableFrames
@@ -168,14 +167,6 @@ def test_images_are_those_that_are_stored_whatever_their_exif_orientation(orient
         (120, 160, 3) if orientation == 3 else (160, 120, 3)
     )
     np.testing.assert_array_equal(Colmap(str(tmp_path), size=SIZE)[0].image, plain)
-
-
-def test_a_name_of_three_words_is_no_line_of_points(tmp_path):
-    """Where a program leaves the points out, every second image was lost without a word."""
-    images = write_colmap(tmp_path) / "images.txt"
-    images.write_text(images.read_text().replace("img", "IMG 2 (3)").replace("\n\n", "\n"))
-    with pytest.raises(ValueError, match=r"images.txt:3: expected the points of image IMG 2 \(3\)10.png"):
-        load_colmap(images.parent)
 
 
 def test_of_several_models_the_largest_is_taken_and_what_has_no_pose_is_said(tmp_path):

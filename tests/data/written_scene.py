@@ -5,6 +5,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 NUM_FRAMES = 3
 
@@ -58,6 +59,14 @@ def moved(dataset, i: int, j: int) -> tuple[np.ndarray, np.ndarray]:
     points = np.stack([(u - cx) / fx * z, (v - cy) / fy * z, z, np.ones_like(z)])
     x, y, z = (np.linalg.inv(dataset[j].T_world_camera) @ a.T_world_camera @ points)[:3]
     return np.stack([v, u]), np.stack([fx * x / z + cx, fy * y / z + cy, z])
+
+
+def scalar_first(pose: np.ndarray) -> np.ndarray:
+    """What a reader of x y z w makes of the pose's quaternion, written w x y z."""
+    changed = pose.copy()
+    w_x_y_z = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
+    changed[:3, :3] = Rotation.from_quat(w_x_y_z).as_matrix()
+    return changed
 
 
 def write_seven_scenes(root: Path) -> None:

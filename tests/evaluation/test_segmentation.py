@@ -190,19 +190,3 @@ def test_every_vertex_has_the_class_of_its_id_and_a_missing_file_is_named(tmp_pa
         read_labelled_mesh(tmp_path, "office0", CLASSES)
     with pytest.raises(ValueError, match=r"lacks room7_mesh.ply, room7.txt: .*scenes="):
         read_labelled_mesh(tmp_path, "room7", CLASSES)
-
-
-@pytest.mark.parametrize(
-    ("ids", "message"),
-    [
-        ([93, 20, 93], r"office0.txt has 3 labels and .*office0_mesh.ply 4 vertices: fetch both files of the same"),
-        ([93, 20, 93, 17], r"office0.txt: no name in classes.txt for id 17"),
-        ([93, 20, 93, 255], r"office0.txt: no name in classes.txt for id 255, but for id -1: ids of 16 bits"),
-        ([93, 20, 93, "wall"], r"office0.txt is no list of whole numbers"),
-        ([93, 20, 93, "9" * 30], r"office0.txt is no list of whole numbers"),
-    ],
-)
-def test_labels_that_do_not_fit_are_named(tmp_path, ids, message):
-    write_scene(tmp_path, ids)
-    with pytest.raises(ValueError, match=message):
-        read_labelled_mesh(tmp_path, "office0", CLASSES)

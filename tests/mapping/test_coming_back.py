@@ -6,13 +6,12 @@ import jax
 import numpy as np
 import pytest
 from scene import assert_same
-from walks import BACK, NEVER_FOUND, THERE, Apart, Blinded, Misled, config, mapped, prior_of, same_run, walk
+from walks import BACK, NEVER_FOUND, THERE, Apart, Blinded, Misled, config, mapped, prior_of, walk
 
 from emgs_jax import load_map
 from emgs_jax.back_end.saved_map import load_saved_map
 from emgs_jax.geometry import pose_difference
 from emgs_jax.localization import LEAST_NOISE
-from emgs_jax.mapping.checkpoint import CheckpointConfig, Keeper
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.runs.files import save_progress
 from emgs_jax.runs.metrics import score_back_end
@@ -90,18 +89,6 @@ def test_nothing_begins_anew_where_nothing_leads():
     assert "restarted" not in {record.location for record in run.records}
 
 
-@pytest.mark.weekly
-def test_a_run_that_is_stopped_after_it_came_back_has_the_same_bits(tmp_path):
-    frames, patience = walk((*THERE, *BACK)), config().graph.relocalization.patience
-    keep = lambda: Keeper(tmp_path / "checkpoint.npz", CheckpointConfig(every=1000), {})  # noqa: E731
-    prior = Blinded(prior_of(frames), len(THERE))
-    stopped = mapped(frames, prior, keeper=keep(), stop=len(THERE) + patience + 1)
-    assert len(stopped.records) < len(frames) and "relocalized" in [record.location for record in stopped.records]
-    keeper = keep()
-    assert keeper.found is not None
-    same_run(mapped(frames, prior, keeper=keeper), kidnapped())
-
-
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     folder, frames = tmp_path_factory.mktemp("saved"), walk(THERE)
@@ -166,16 +153,6 @@ def test_a_run_goes_on_in_a_saved_map_and_can_be_saved_itself(folder, tmp_path):
     again = loaded(tmp_path, "extend")
     assert again.back_end.first_node == len(THERE) + len(BACK)
     assert_same(jax.device_get(again.map), jax.device_get(run.map))
-
-
-@pytest.mark.weekly
-def test_a_run_in_a_saved_map_that_is_stopped_has_the_same_bits(folder, tmp_path):
-    frames = walk(BACK)
-    prior = prior_of(frames)
-    keep = lambda: Keeper(tmp_path / "checkpoint.npz", CheckpointConfig(every=1000), {})  # noqa: E731
-    mapped(frames, prior, loaded(folder, "extend"), keep(), stop=3)
-    again = mapped(frames, prior, loaded(folder, "extend"), keep())
-    same_run(again, mapped(frames, prior, loaded(folder, "extend")))
 
 
 def test_images_of_another_place_are_not_found_and_the_run_says_so(folder):

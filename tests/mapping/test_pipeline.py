@@ -7,15 +7,13 @@ import hydra
 import jax
 import numpy as np
 import pytest
-from scene import slam_config
-from scipy.spatial import cKDTree
+from scene import same_bits, slam_config
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose, dataset, exact, map_tiny
 
 from emgs_jax.config.configure import build
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.device.clock import Clock
-from emgs_jax.evaluation.reconstruction import ground_truth_cloud
 from emgs_jax.mapping import pipeline
 from emgs_jax.mapping.pipeline import finish_run, map_frames
 from emgs_jax.mapping.run import clamped, new_run
@@ -28,11 +26,6 @@ from emgs_jax.runs.gathering import RawPrior
 from emgs_jax.runs.metrics import new_scorer, score_map, score_prior
 
 pytestmark = pytest.mark.xdist_group("tiny")
-
-
-def same_bits(tree, other) -> bool:
-    pairs = zip(jax.tree.leaves(tree), jax.tree.leaves(other), strict=True)
-    return all(np.asarray(a).tobytes() == np.asarray(b).tobytes() for a, b in pairs)
 
 
 class Counting:
@@ -202,16 +195,6 @@ def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     raw = RawPrior(dense.cloud, Spool())
     assert score_map(blind, dense.cloud, dense.cloud, None, scorer) == score_prior(blind, raw, scorer) == {}
     assert dense.rendering == {}
-
-
-def test_the_densified_cloud_of_an_exact_run_lies_on_the_true_surfaces():
-    """Within the size of a Gaussian: 8 points of about 3 cm spacing."""
-    run, _ = exact()
-    protocol = hydra.utils.instantiate(compose().evaluation)
-    dense = dense_map(run, dataset(), hydra.utils.instantiate(compose().densify), protocol)
-    truth = ground_truth_cloud(list(dataset()), dataset().intrinsics, protocol)
-    distance, _ = cKDTree(truth.points).query(dense.cloud.points)
-    assert np.median(distance) < 0.03
 
 
 def test_the_map_does_not_start_at_the_origin_but_at_the_first_true_pose_and_at_the_identity_without_one():

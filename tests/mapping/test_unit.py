@@ -30,11 +30,7 @@ def a_run(log_scale: float) -> MappingRun:
     records = [FrameRecord(0, None, None, "initialization", pose=poses[0], scale=1.0)]
     known = {"scale": 0.9, "covariance": np.eye(6)}
     records += [FrameRecord(i, None, None, "tracked", pose=poses[i], **known) for i in (1, 2)]
-    known = (
-        jnp.asarray(log_scale),
-        jnp.eye(7),
-        jaxlie.SE3(jnp.tile(pose((0.3, 0, 0), SAID).wxyz_xyz, (2, 1))),
-    )
+    known = (jnp.asarray(log_scale), jnp.eye(7), jaxlie.SE3(jnp.tile(pose((0.3, 0, 0), SAID).wxyz_xyz, (2, 1))))
     estimate = eqx.tree_at(lambda b: (b.log_scale, b.covariance, b.repeats.predicted), exact_estimate(), known)
     map = new_map(random_gaussians(9), jnp.ones(9), jnp.ones(()), jnp.asarray(0))
     last = jaxlie.SE3.from_matrix(jnp.asarray(poses[-1], jnp.float32))

@@ -47,11 +47,7 @@ def test_frames_before_there_is_a_map_count_too():
 
 @pytest.mark.parametrize(
     ("location", "words"),
-    [
-        ("restarted", "6.jpg: relocalization fails"),
-        ("new_submap", "a new map begins"),
-        ("joined", "both are one map"),
-    ],
+    [("restarted", "6.jpg: relocalization fails"), ("new_submap", "a new map begins"), ("joined", "both are one map")],
 )
 def test_where_a_map_restarts_or_begins_and_where_two_are_joined_is_said_once(location, words):
     rows = records("it" + "l" * 4 + "ittt")

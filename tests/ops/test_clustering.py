@@ -77,14 +77,6 @@ def test_kmeans_equals_lloyd(num_iterations):
     assert exists.all()
 
 
-def test_with_a_seed_on_every_point_the_points_are_the_centroids():
-    points = RNG.uniform(-1, 1, (NUM_SEEDS, 3)).astype(np.float32)
-    centroids, exists, counts = clustered(points, np.ones(NUM_SEEDS), points)
-    np.testing.assert_array_equal(centroids, points)
-    assert exists.all()
-    np.testing.assert_array_equal(counts, 1)
-
-
 def test_an_empty_cluster_stays_where_it_was_and_becomes_invalid():
     points = RNG.uniform(-1, 1, (30, 3)).astype(np.float32)
     centroids, exists, counts = clustered(points, np.ones(30), [points[0], np.full(3, 50.0)])

@@ -158,9 +158,6 @@ def test_compaction_lists_the_true_rows_in_order_and_counts_what_did_not_fit():
     rows, exists, overflow = compacted(mask, 2)  # capacity - 1
     np.testing.assert_array_equal(rows, [1, 2])
     assert exists.all() and overflow == 1
-
-
-def test_compaction_of_nothing_is_all_missing():
     rows, exists, overflow = compacted(np.zeros(3, bool), 5)
     np.testing.assert_array_equal(rows, [3] * 5)
     assert not exists.any() and overflow == 0

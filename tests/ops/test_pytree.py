@@ -14,7 +14,6 @@ from emgs_jax.ops.pytree import (
     join_rows,
     put_rows,
     split_rows,
-    stack,
     static,
     take_rows,
     traced,
@@ -66,12 +65,6 @@ def test_where_chooses_whole_rows_even_against_nan():
     chosen = where_rows(mask, ROWS, poisoned)
     np.testing.assert_array_equal(chosen["b"][::2], np.asarray(ROWS["b"])[::2])
     assert np.isnan(chosen["b"][1::2]).all() and np.isnan(chosen["a"][1::2]).all()
-
-
-def test_a_stack_holds_every_tree_as_a_row():
-    stacked = stack([ROWS, jax.tree.map(lambda leaf: leaf + 1, ROWS)])
-    assert_same(jax.tree.map(lambda leaf: leaf[0], stacked), ROWS)
-    np.testing.assert_array_equal(stacked["a"][1], [1, 2, 3, 4])
 
 
 @pytest.mark.parametrize(

@@ -265,34 +265,6 @@ def test_chi2_of_noisy_measurements_has_its_distribution():
     assert info.dof == 7 * edges.a.shape[0] + 59 - 7 * 59
 
 
-@pytest.fixture(scope="module")
-def closures():
-    """RMSE of four closures of two laps with 20 true loops, without and with 10 false ones, and the loops' weights."""
-    found = []
-    with jax.enable_x64(True):
-        for seed in range(4):
-            truth, graph = noisy_laps(80, 20, seed)
-            rng = np.random.default_rng(100 + seed)
-            false = rng.integers(0, 80, (40, 2))
-            false = false[np.abs((false[:, 0] - false[:, 1] + 20) % 40 - 20) > 8][:10]  # of places far apart
-            wrong = measure_loops(truth, false)
-            at_once = poses_of(exp(rng.normal(size=(len(false), 6)) * 0.05))
-            wrong = without_scale(put(wrong, Z_a_b=at_once))
-            clean, _ = optimize(graph, config())
-            spoilt, info = optimize(PoseGraph(graph.nodes, join(graph.factors, wrong)), config())
-            assert len(false) == 10
-            found.append((rmse(graph.nodes, truth), rmse(clean, truth), rmse(spoilt, truth), info.factor_weights[-30:]))
-    return found
-
-
-@pytest.mark.slow
-def test_ten_false_loops_among_thirty_hardly_matter(closures):
-    before, clean, spoilt, weights = map(np.array, zip(*closures, strict=True))
-    assert (spoilt <= 1.1 * clean).all()
-    assert clean.mean() < 0.6 * before.mean()
-    assert weights[:, :20].mean() > 0.9 and weights[:, 20:].max() < 0.2
-
-
 def drifted(num_nodes: int, seed: int) -> tuple[Nodes, PoseGraph]:
     """Odometry five times as noisy as its loops, of which there are three: metres of drift."""
     rng, truth = np.random.default_rng(seed), walk(num_nodes)

@@ -70,12 +70,7 @@ class Double:
         spoil: changes the outputs of one view in place.
     """
 
-    def __init__(
-        self,
-        scene,
-        convert: Callable = np.asarray,
-        spoil: Callable = lambda index, output: None,
-    ):
+    def __init__(self, scene, convert: Callable = np.asarray, spoil: Callable = lambda index, output: None):
         self._scene, self._convert, self._spoil = scene, convert, spoil
         self.seen = []  # keys of every view of the last call
 

@@ -18,15 +18,7 @@ from emgs_jax.evaluation.reconstruction import compare_clouds, reference
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.runs.gathering import RawPrior
-from emgs_jax.runs.metrics import (
-    Scorer,
-    describe,
-    new_scorer,
-    score_map,
-    score_prior,
-    seconds_per_frame,
-    spent,
-)
+from emgs_jax.runs.metrics import Scorer, describe, new_scorer, score_map, score_prior, seconds_per_frame, spent
 
 CLASSES = ("wall", "floor")
 NUM_FRAMES = len(STATUSES)

@@ -172,24 +172,6 @@ def test_pictures_are_drawn_from_given_poses_or_frames(folder, tmp_path):
     assert given_views(asking(folder), run) is None
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"text": " "}, "text must be a word or a list of words, none empty"),
-        ({"text": 1}, "text must be a word or a list of words, none empty and each once, got 1"),
-        ({"text": "sofa", "against": True}, "against must be a word or a list of words"),
-        ({"text": "sofa", "against": "lamp"}, "'lamp' is no word of"),
-        ({"classes": "nowhere.txt"}, "class file nowhere.txt does not exist"),
-        ({"text": "sofa", "instances__reach": 0}, "instances.reach must be a number"),
-        ({"text": "sofa", "features__text": "nowhere.npz"}, "nowhere.npz is no file"),
-    ],
-)
-def test_a_question_that_cannot_be_asked_is_named(folder, values, message):
-    with pytest.raises(ValueError, match=message):
-        said(folder, **values)
-    assert not (folder / "query.json").exists()
-
-
 def test_embeddings_of_another_width_or_encoder_are_refused_and_both_are_named(folder, tmp_path):
     wide = TextEmbeddings(("sofa",), np.ones((1, 3), np.float32), (), {"prior": "simulated"})
     save_text(tmp_path / "wide.npz", wide)

@@ -138,25 +138,6 @@ def test_a_failed_copy_leaves_nothing(run):
     assert not [path for path in run.folder.iterdir() if "scaled" in path.name]
 
 
-@pytest.mark.parametrize(
-    ("values", "message"),
-    [
-        ({"length": [1, 5]}, r"length must be \[frame,frame,metres\]"),
-        ({"length": [1, 5, 0]}, r"length must be \[frame,frame,metres\]"),
-        ({"length": [1.5, 5, 2]}, r"length must be \[frame,frame,metres\]"),
-        ({"length": [1, 9, 2]}, "frame 9 is none of the run's"),
-        ({"length": [1, 3, 2]}, "frame 3 is lost, so its pose is a guess"),
-        ({"length": [1, 1, 2]}, "these two cameras are at one place"),
-        ({"scale": 0}, "scale must be .*, got 0"),
-        ({"scale": 2, "length": [1, 5, 2]}, "give one of them"),
-    ],
-)
-def test_a_length_or_scale_that_says_nothing_is_refused(run, values, message):
-    with pytest.raises(ValueError, match=message):
-        exported(run, **values)
-    assert not (run.folder / "scaled").exists()
-
-
 def test_frames_are_counted_as_frames_jsonl_counts_them(run):
     """Where unreadable images were left out, rows and numbers differ."""
     shifted = replace(run, frames=[{**frame, "index": frame["index"] + 10} for frame in run.frames])

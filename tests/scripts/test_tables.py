@@ -13,7 +13,7 @@ import tools.tables
 from emgs_jax.io.files import write_json
 from emgs_jax.runs.provenance import RAW_PRIOR, RESULT_FORMAT, prefixed
 from emgs_jax.runs.results import METRICS_FILE
-from tools.tables import COLUMNS, CONFIG, SHORT, block, evaluations, short_block, tables, with_blocks
+from tools.tables import COLUMNS, CONFIG, SHORT, block, short_block, tables
 
 PAGE = "before\n<!-- table: some -->\nold\n<!-- end -->\nbetween\n<!-- table: other -->\n<!-- end -->\nafter\n"
 ONE_COMMIT = {"revision": "0123456789abcdef", "dirty": False}
@@ -70,31 +70,12 @@ def test_the_short_table_has_what_is_named_and_the_best_of_each_column_in_bold(t
     assert [cells(line)[0] for line in alone.splitlines() if "ours" in line] == ["room, level 2"]
 
 
-def test_the_line_above_a_table_says_where_it_comes_from_and_names_every_device(tmp_path):
-    paths = [written(tmp_path, seed) for seed in (3, 4)]
-    metrics = json.loads(paths[1].read_text())
-    metrics["provenance"]["device"] = {"kind": "gpu", "cpu_count": 16}
-    paths[1].write_text(json.dumps(metrics))
-    about = " ".join(block(paths, {"synthetic": "room"}).strip().split("\n\n")[0].splitlines())
-    facts = "simulated", "synthetic room0 (40 frames)", "3, 4", "paper/sim3", "`0123456789ab`"
-    assert all(fact in about for fact in (*facts, "device cpu, 2 CPU cores, gpu, 16 CPU cores;")), about
-
-
 @pytest.mark.parametrize(
     "other", [{"revision": "f" * 16, "dirty": False}, ONE_COMMIT | {"dirty": True}, ONE_COMMIT | {"dirty": None}, None]
 )
 def test_results_of_other_or_changed_code_are_refused(tmp_path, other):
     with pytest.raises(ValueError, match="of one commit without changes"):
         block([written(tmp_path, 3), written(tmp_path, 4, other)], {"synthetic": "room"})
-
-
-def test_only_what_stands_between_the_markers_changes_and_a_second_time_nothing_does(tmp_path):
-    page = tmp_path / "page.md"
-    page.write_text(PAGE)
-    once = with_blocks(page, {"some": "\nnew\n", "other": r"\1 & $2" + "\n"})
-    assert once == PAGE.replace("old\n", "\nnew\n").replace("other -->\n", "other -->\n\\1 & $2\n")
-    page.write_text(once)
-    assert with_blocks(page, {"some": "\nnew\n"}) == once
 
 
 @pytest.fixture
@@ -141,26 +122,6 @@ def test_what_is_finished_is_not_run_again_and_the_page_is_written_when_all_is_t
     monkeypatch.setattr(tools.tables, "git_now", lambda: None)
     tables(settings)
     assert len(runs) == 5 and (page.read_text(), Path(settings["full_page"]).read_text()) == (text, full)
-
-
-@pytest.mark.parametrize("page", ["page", "full_page"])
-def test_a_page_that_cannot_be_written_is_named_before_the_runs(settings, page, monkeypatch):
-    """Elsewhere than in the clone there is no README.md, which was told after all evaluations."""
-    monkeypatch.setattr(tools.tables, "evaluate", None)
-    Path(settings[page]).unlink()
-    with pytest.raises(ValueError, match=f"{settings[page]} is no file: give page=FILE and full_page=FILE"):
-        tables(settings)
-    Path(settings[page]).write_text("no place")
-    with pytest.raises(ValueError, match="not one"):
-        tables(settings)
-
-
-def test_the_data_of_the_tables_may_lie_anywhere(settings):
-    (found,) = evaluations(settings | {"root": "it's [mine], ü"}, "some")
-    assert "it's [mine], ü" not in str(found["suite"]["data"]["synthetic"])
-    config = settings | {"root": "it's [mine], ü", "tables": {"one": [{"data": ["tum"], "seeds": [0], "settings": {}}]}}
-    (found,) = evaluations(config, "one")
-    assert "it's [mine], ü/" in str(found["suite"]["data"]["tum"])
 
 
 def test_both_pages_have_the_places_of_all_tables_every_row_has_a_title_and_both_are_of_one_commit():

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import BadFrameError, Frame
 from emgs_jax.prior.files.conventions import Sight, check_conventions, check_truth, misfit
-from tests.data.written_scene import plane_depth, scene_pose
+from tests.data.written_scene import plane_depth, scalar_first, scene_pose
 
 INTRINSICS, SIZE = (60.0, 60.0, 31.5, 23.5), (48, 64)
 
@@ -24,14 +24,6 @@ def sight(pose: np.ndarray, said: np.ndarray | None = None, noise: float = 0.0) 
     depth = np.minimum(np.where(wall > 0, wall, np.inf), np.where(floor > 0, floor, np.inf))
     depth = np.where(np.isfinite(depth), depth, 0) * np.exp(noise * np.random.default_rng(0).normal(size=SIZE))
     return Sight(backproject(depth, INTRINSICS), depth > 0, pose if said is None else said)
-
-
-def scalar_first(pose: np.ndarray) -> np.ndarray:
-    """What a reader of x y z w makes of the pose's quaternion, written w x y z."""
-    changed = pose.copy()
-    w_x_y_z = Rotation.from_matrix(pose[:3, :3]).as_quat()[[3, 0, 1, 2]]
-    changed[:3, :3] = Rotation.from_quat(w_x_y_z).as_matrix()
-    return changed
 
 
 def pose(turn: float, x: float, z: float) -> np.ndarray:

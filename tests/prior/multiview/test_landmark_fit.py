@@ -115,10 +115,7 @@ def test_the_uncertainty_of_a_scale_is_what_it_misses_the_truth_by():
 
 @pytest.mark.parametrize(
     ("said", "kind", "message"),
-    [
-        ("affine_inverse", "metric", "they are inverse depths"),
-        ("up_to_scale", "affine_inverse", "they are depths"),
-    ],
+    [("affine_inverse", "metric", "they are inverse depths"), ("up_to_scale", "affine_inverse", "they are depths")],
 )
 def test_a_wrong_kind_is_named_by_the_landmarks(said, kind, message):
     values, landmarks = sequence(said, np.zeros(4))

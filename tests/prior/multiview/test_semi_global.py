@@ -44,23 +44,3 @@ def test_aggregation_is_the_recursion_along_eight_directions():
     config = depth_config(f"{PREFIX}.small_step=0.1", f"{PREFIX}.large_step=0.5", f"{PREFIX}.edge=0.2").semi_global
     actual = jitted(cost, gray, config)
     np.testing.assert_allclose(actual, slow_aggregate(cost, gray, 0.1, 0.5, 0.2), rtol=1e-5, atol=1e-6)
-
-
-def test_without_penalties_it_is_the_cost_itself_and_half_a_turn_of_the_image_turns_the_result():
-    rng = np.random.default_rng(1)
-    cost, gray = rng.uniform(size=(7, 9, 6)).astype(np.float32), rng.uniform(size=(7, 9)).astype(np.float32)
-    config = depth_config(f"{PREFIX}.small_step=0", f"{PREFIX}.large_step=0").semi_global
-    np.testing.assert_allclose(jitted(cost, gray, config), cost, atol=1e-6)
-    config = depth_config().semi_global
-    turned = jitted(cost[::-1, ::-1].copy(), gray[::-1, ::-1].copy(), config)
-    np.testing.assert_allclose(turned[::-1, ::-1], jitted(cost, gray, config), atol=1e-6)
-
-
-def test_an_ambiguous_pixel_takes_its_neighbours_plane_but_not_across_an_edge():
-    cost = np.full((7, 9, 6), 0.5, np.float32)
-    cost[:, :3, 1], cost[:, 5:, 4] = 0.0, 0.0
-    gray = np.zeros((7, 9), np.float32)
-    gray[:, 4:] = 1.0  # the undecided columns 3 and 4 lie on either side of the edge
-    config = depth_config(f"{PREFIX}.small_step=0.2", f"{PREFIX}.large_step=0.4", f"{PREFIX}.edge=0.1").semi_global
-    best = jitted(cost, gray, config).argmin(axis=-1)
-    np.testing.assert_array_equal(best, np.repeat([[1] * 4 + [4] * 5], 7, axis=0))
