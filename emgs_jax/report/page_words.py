@@ -35,7 +35,7 @@ FILES = {
     "report.html": "this page; any browser of 2023 or later",
     "overview.png": "the map from above with both paths, some frames; any viewer of images",
     "metrics.json": "all errors, counts, times, and where the result comes from; any editor",
-    "trajectory.txt": "the pose of every frame, TUM format; evo",
+    "trajectory.txt": "the pose of every frame that is placed, TUM format; evo",
     "trajectory_online.txt": "the poses as they were when the frames were placed, TUM format; evo",
     "frames.jsonl": "a line per frame; any editor, pandas.read_json(…, lines=True)",
     "graph.g2o": "poses and measurements; what reads g2o files",

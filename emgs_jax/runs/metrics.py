@@ -110,19 +110,7 @@ def score_map(
         compared = not_compared(other, "the prior's unit is not the metre") | {"reconstruction/alignment_note": None}
     metrics |= _renamed(compared, f"reconstruction_{other.alignment}/")
     metrics |= _renamed(compare_clouds(centers, truth, poses, config), "reconstruction_centers/")
-    return metrics | _score_labels(labels, poses, scorer) | _score_apart(run)
-
-
-def _score_apart(run: MappingRun) -> Metrics:
-    """Score the paths of submaps that were never joined, each aligned by itself."""
-    found: Metrics = {}
-    for number in run.apart:
-        rows = [record for record in records_apart(run.records, number) if record.true_pose is not None]
-        found[f"submaps/{number}/num_frames"] = len(rows)
-        if rows:
-            poses = (np.stack([getattr(row, name) for row in rows]) for name in ("pose", "true_pose"))
-            found[f"submaps/{number}/ate_sim3_m"] = trajectory_metrics(*poses)["trajectory/ate_sim3_m"]
-    return found
+    return metrics | _score_labels(labels, poses, scorer)
 
 
 def score_cloud(cloud: PointCloud | SpooledCloud, poses: tuple[np.ndarray, np.ndarray], scorer: Scorer) -> Metrics:

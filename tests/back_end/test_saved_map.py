@@ -152,3 +152,14 @@ def test_a_file_that_cannot_be_used_is_named_with_the_reason(graph, folder, chan
     with pytest.raises(ValueError, match=message) as error:
         load(folder, graph)
     assert "places.npz" in str(error.value) and "map again with graph=default" in str(error.value)
+
+
+def test_keyframes_of_other_grids_are_written_on_that_of_the_first(graph, end, tmp_path):
+    """Symptom: merged runs of other `graph.place_recognition.grid` ended in an error of NumPy."""
+    first, *others = end.database.keyframes
+    finer = [replace(one, depths=np.repeat(np.repeat(one.depths, 2, 0), 2, 1)) for one in others]
+    mixed = replace(end, database=replace(end.database, keyframes=(first, *finer)))
+    save_places(tmp_path / "places.npz", mixed, 0.02)
+    found, _ = load_places(tmp_path / "places.npz", BackEnd(graph, CAMERA, 0.01))
+    for one, before in zip(found.database.keyframes, (first, *others), strict=True):
+        np.testing.assert_allclose(one.depths, before.depths, rtol=1e-6)

@@ -7,6 +7,7 @@ from emgs_jax.report.columns import (
     MAIN,
     PLACED,
     RENDERED,
+    SHARE,
     Cell,
     Line,
     Table,
@@ -42,6 +43,12 @@ def test_metres_are_shown_in_centimetres_and_less_of_them_is_better_and_the_rest
         is_length = column.key.endswith("_m")
         assert (column.factor, column.is_lower_better) == ((100.0, True) if is_length else (1.0, False)), column.key
         assert column.title.endswith(units[column.key.rpartition("_")[2]])
+
+
+def test_the_share_of_placed_frames_stands_beside_the_error_where_one_is_missing():
+    columns, row = (MAIN[0], SHARE, MAIN[1]), {MAIN[0].key: 0.1, MAIN[1].key: 0.1}
+    assert known(columns, [row | {SHARE.key: 100.0}, row]) == [MAIN[0], MAIN[1]]
+    assert known(columns, [row | {SHARE.key: 100.0}, row | {SHARE.key: 97.5}]) == [*columns]
 
 
 def test_no_two_columns_of_a_table_have_one_title():
