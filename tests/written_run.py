@@ -62,8 +62,9 @@ def _files(has_truth: bool) -> dict[str, bytes]:
     with TemporaryDirectory() as name:
         folder = Path(name)
         save_progress(folder, run)
-        times = [record.timestamp for record in run.records]
-        save_trajectory_tum(folder / "trajectory_online.txt", times[1:], poses_along(np.linspace(0.1, 0.7, 5)))
+        placed = [row for row, status in enumerate(STATUSES) if status != "lost"]
+        times, online = [run.records[row].timestamp for row in placed[1:]], poses_along(np.linspace(0.1, 0.7, 5))
+        save_trajectory_tum(folder / "trajectory_online.txt", times, online[np.array(placed[1:]) - 1])
         save_text(folder / "text.npz", TextEmbeddings(CLASSES, np.eye(2, dtype=np.float32), (), {"prior": "simulated"}))
         with FrameLog(folder / "frames.jsonl") as log:
             for row, record in enumerate(run.records):

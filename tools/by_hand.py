@@ -72,9 +72,9 @@ io/trajectory: quaternions with w first are read (io/test_trajectory_file)
 io/ply: quaternions with w last
   - [:, [3, 0, 1, 2]]
   + [:, [0, 1, 2, 3]]
-data/reading: BGR for RGB
-  - return cv2.cvtColor(image, cv2.COLOR_BGR2RGB)
-  + return image
+data/tones: BGR for RGB (data/test_images)
+  - return cv2.cvtColor(image if tones is None else tones.shown(image), cv2.COLOR_BGR2RGB)
+  + return image if tones is None else tones.shown(image)
 data/seven_scenes: the colour camera on the other side
   - T_world_depth @ np.linalg.inv(T_COLOR_DEPTH) if is_moved
   + T_world_depth @ T_COLOR_DEPTH if is_moved

@@ -199,17 +199,18 @@ class PlacedPaths(NamedTuple):
 def placed_paths(run: FinishedRun) -> PlacedPaths:
     """Align the true path and the raw prior's with ours, and return the remaining differences.
 
-    Each path is aligned with the true one separately, as for its error in metrics.json. Without truth, the raw prior's
-    path stays where it is; in a run that continues a saved map it has its own world and unit, so it is aligned with
-    ours.
+    Each path is aligned with the true one separately, over the placed frames, as for its error in metrics.json. Without
+    truth, the raw prior's path stays where it is; in a run that continues a saved map it has its own world and unit, so
+    it is aligned with ours.
     """
     known, with_scale = run.has_truth, run.provenance["config"].get("evaluation", {}).get("alignment") == "sim3"
     back, raw, errors = None, run.raw, {}
     for name, poses in (("ours", run.poses), ("online", run.online), ("raw", run.raw)):
-        rows = known & (poses is not None and np.isfinite(poses).all((1, 2)))
+        rows = known & run.is_placed & (poses is not None and np.isfinite(poses).all((1, 2)))
         if rows.any():
             alignment, _ = align_poses(poses[rows], run.truth[rows], with_scale)
-            errors[name] = np.linalg.norm(alignment.apply(poses[:, :3, 3]) - run.truth[:, :3, 3], axis=1)
+            off = np.linalg.norm(alignment.apply(poses[:, :3, 3]) - run.truth[:, :3, 3], axis=1)
+            errors[name] = np.where(run.is_placed, off, np.nan)
             back = alignment.inverse() if back is None else back
             raw = back.apply_to_poses(alignment.apply_to_poses(poses)) if name == "raw" else raw
     is_shown = run.is_placed & np.isfinite(run.raw).all((1, 2))

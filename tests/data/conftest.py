@@ -70,3 +70,6 @@ def depth_gaps():
         return (b.depth[row, column] - z)[seen]
 
     return measure
+
+
+bonn_root = tum_root  # the same layout

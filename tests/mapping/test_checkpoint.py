@@ -183,7 +183,7 @@ def test_a_scheduler_ends_a_run_with_one_word_and_the_same_command_goes_on(tmp_p
     os.kill(program.pid, signal.SIGTERM)
     assert ended(program) == 128 + signal.SIGTERM, said.read_text()
     assert "terminated\n" in said.read_text() and "Traceback" not in said.read_text()
-    assert f"the same command with hydra.run.dir={folder} goes on" in said.read_text()
+    assert f"the same command with hydra.run.dir={folder} resumes there" in said.read_text()
     with counted(monkeypatch) as steps:
         experiments.run.run(compose(*OVERRIDES), folder)
     assert len(steps) < NUM_FRAMES - 1, "in another process"

@@ -11,7 +11,7 @@ from emgs_jax.structure.model import Structure
 
 def test_sources_have_their_poses_and_fewer_than_asked_for_are_repeated_without_counting():
     poses = np.stack([matrix((0, 0.1 * row, 0), (row, 0, 0)) for row in range(3)])
-    found = Structure([], np.zeros(3, int), poses, np.zeros((3, 6, 6)), [np.arange(0)] * 3, np.zeros(3, bool))
+    found = Structure([], np.zeros(3, int), poses, np.zeros((3, 6, 6)), [np.arange(0)] * 3)
     sources = sources_of(found, 0, [2, 1], 3, lambda frame: np.full(2, frame))
     np.testing.assert_array_equal(sources.views, [[2, 2], [1, 1], [2, 2]])
     np.testing.assert_array_equal(sources.is_used, [True, True, False])

@@ -12,8 +12,9 @@ from emgs_jax.config.configure import compose
 from emgs_jax.evaluation.segmentation import confusion_matrix, transfer_labels
 from emgs_jax.io.map_file import load_map
 from emgs_jax.io.ply import structured, write_ply
-from emgs_jax.io.trajectory import load_trajectory_tum, to_tum
+from emgs_jax.io.trajectory import to_tum
 from emgs_jax.report.segmentation_table import Counting
+from emgs_jax.runs.finished_run import read_run
 from experiments.segment import segment
 from tests.written_run import written_run
 
@@ -40,7 +41,7 @@ def write_truth(folder, run, wrong: int = 0, shift=(0.0, 0.0, 0.0)):
 def moved_run(folder):
     """True poses are the estimated ones, moved."""
     written_run(folder)
-    _, poses = load_trajectory_tum(folder / "trajectory.txt")
+    poses = read_run(folder).poses
     poses[2, 1, 3] += 0.2  # a straight path leaves the roll about it open
     text = (folder / "trajectory.txt").read_text().splitlines()
     text[3] = " ".join([text[3].split()[0], *(f"{value:.9f}" for value in to_tum(poses[2]))])

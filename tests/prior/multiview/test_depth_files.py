@@ -166,7 +166,7 @@ def room(factor=1.0):
     world = World(factor * points, SimpleNamespace(mean_focal_length=lambda: float(camera.focal[0])))
     count = len(frames)
     covariance = np.zeros((count, 6, 6))
-    found = Structure([world], np.zeros(count, int), T, covariance, landmarks, np.zeros(count, bool))
+    found = Structure([world], np.zeros(count, int), T, covariance, landmarks)
     return drawn, found, camera, frames
 
 
@@ -202,7 +202,7 @@ def test_a_landmark_is_as_uncertain_as_its_parallax_says():
     T[1, 0, 3] = 0.1
     points = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 4.0]])
     world, shown = World(points, found.worlds[0].camera), [np.arange(2)] * 2
-    two = Structure([world], np.zeros(2, int), T, np.zeros((2, 6, 6)), shown, np.zeros(2, bool))
+    two = Structure([world], np.zeros(2, int), T, np.zeros((2, 6, 6)), shown)
     landmarks = landmarks_of(two, 0, point_information(two, 0, pixel_std=0.5), camera, cell=0.1)
     expected = 0.5 * landmarks.depth / (float(camera.focal[0]) * 0.1)
     np.testing.assert_allclose(landmarks.std, expected, rtol=3e-3)  # f b / distance, which z is to (b / z)²
