@@ -65,6 +65,7 @@ def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
         "depth_noise": depth_noise,
         "num_trained": end.database.num_trained,
         "has_one_unit": end.has_one_unit,
+        "first_node": end.first_node,
     }
     arrays = {name: np.array([getattr(node, field) for node in end.nodes]) for name, field in NODES.items()} | {
         "words": end.database.words
@@ -109,6 +110,11 @@ def load_places(path: Path, end: BackEnd) -> tuple[BackEnd, float]:
         raise ValueError(
             f"{path} holds no keyframes to continue from ({error}): map again with graph=default"
         ) from error
+
+
+def first_node_of(path: Path) -> int:
+    """Read how many nodes the run of a places.npz took over from a saved map; 0 in files of older versions."""
+    return int(load_headed(path, HEADER)[0].get("first_node", 0))
 
 
 def load_saved_map(

@@ -174,5 +174,8 @@ def read_nerfstudio(path: Path) -> Solved:
         reading.as_pose(" ".join(map(repr, row)), f"{path}, frame {name}")
         for name, row in zip(names, rows, strict=True)
     ]
-    images, masks = [find_image(path.parent, name) for name in names], [mask and path.parent / mask for mask in masks]
+    images, masks = (
+        [find_image(path.parent, name) for name in names],
+        [find_image(path.parent, mask) if mask else None for mask in masks],
+    )
     return Solved(images, poses, cameras, path, (path,), masks=masks)

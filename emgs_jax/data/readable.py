@@ -11,6 +11,7 @@ import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.masks import MANY, Masks, files_of, masked
+from emgs_jax.data.reading import AS_STORED, read_bytes
 from emgs_jax.data.spool import Spool
 
 MAX_KEPT_BYTES = 2**30  # of cached frames, uncompressed; others are read again
@@ -113,6 +114,8 @@ class ReadableFrames:
         if self._mask_files[index] is None:
             return None
         mask, image = self._mask_files[index]
+        if getattr(self._dataset, "_flags", 0) & AS_STORED:  # these images are not turned, whatever their EXIF says
+            image = None
         is_out = self._masks.decoded(mask, self._dataset.raw_size, image)
         return self._masks.fitted(self._dataset.straight(index, is_out), size)
 
@@ -128,6 +131,9 @@ class ReadableFrames:
     def fingerprint(self) -> str:
         """The data set's fingerprint, unless frames are left out."""
         whole = self._dataset.fingerprint()
+        if self.has_masks:
+            masks = [hashlib.sha256(read_bytes(found[0])).hexdigest() for found in self._mask_files if found]
+            whole = hashlib.sha256(repr((whole, masks, self._masks.border)).encode()).hexdigest()
         return hashlib.sha256(repr((whole, self.kept)).encode()).hexdigest() if self.skipped else whole
 
 

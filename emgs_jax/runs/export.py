@@ -91,7 +91,8 @@ def _project(run: FinishedRun, folder: Path, dataset: ReadableFrames, config: Ex
         masks = [f"masks/{name}{'.png' * is_colmap}" for name in names]
         (folder / "masks").mkdir()
         for row, mask in zip(rows, masks, strict=True):
-            save_png(folder / mask, np.uint8(255) * ~moving_mask(run.frames[row], size))
+            is_out, own = moving_mask(run.frames[row], size), dataset[row].mask
+            save_png(folder / mask, np.uint8(255) * ~(is_out if own is None else is_out | own))
     poses, (points, colors) = run.poses[rows], _cloud(run, config.max_points)
     if is_colmap:
         model = folder / "sparse" / "0"

@@ -89,6 +89,7 @@ def read_run(folder: Path) -> FinishedRun:
     frames = [line for line in lines if line.get("pose") is not None]
     placed = [row for row, line in enumerate(frames) if line["status"] not in UNPLACED]
     _, path = load_trajectory_tum(folder / "trajectory.txt")
+    path = path[placed] if len(path) == len(frames) else path  # earlier versions wrote guesses, too
     if len(placed) != len(path):
         counts = f"frames.jsonl has {len(placed)} frames that are placed and trajectory.txt {len(path)}"
         raise ValueError(f"{folder}: {counts}: they are of two runs, or one was cut off; run again")

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from hydra.errors import InstantiationException
 from omegaconf import DictConfig, OmegaConf
 
-from emgs_jax.back_end.saved_map import PLACES_FILE, SavedMap, load_places
+from emgs_jax.back_end.saved_map import PLACES_FILE, SavedMap, first_node_of, load_places
 from emgs_jax.back_end.state import BackEnd, Node
 from emgs_jax.config.configure import CONF, build, build_dataset, compose, graph_config, message_of
 from emgs_jax.data.joined import common_camera, joined_name
@@ -53,7 +54,7 @@ def mergeable(folder: Path) -> MergeableRun:
         )
     end, depth_noise = load_places(folder / PLACES_FILE, BackEnd(graph, _camera_of(run)[1], float(slam.fit.min_std)))
     records = tuple(record_of(line, pose) for line, pose in zip(run.frames, run.poses, strict=True))
-    end, lost = with_records(end, records, run.online)
+    end, lost = with_records(end, records, run.online, first_node_of(folder / PLACES_FILE))
     slam = replace(slam, submap=replace(slam.submap, map_capacity=run.map.weight.shape[0]))
     known = unvisited(SavedMap(run.map, end, depth_noise, is_frozen=False, checksum=""), run.camera, slam)
     return MergeableRun(run, with_lost(Atlas(run.camera, slam, end, {0: known}), lost), records)
@@ -74,19 +75,22 @@ def record_of(line: Mapping[str, Any], pose: np.ndarray) -> FrameRecord:
     return FrameRecord(**known | {"pose": pose})
 
 
-def with_records(end: BackEnd, records: Sequence[FrameRecord], online: np.ndarray) -> tuple[BackEnd, Sequence[Node]]:
+def with_records(
+    end: BackEnd, records: Sequence[FrameRecord], online: np.ndarray, first: int
+) -> tuple[BackEnd, Sequence[Node]]:
     """Add the records' data to the nodes, and make nodes for frames before the map began.
 
     Args:
-        online: poses as first estimated, nan before the map began.
+        online: poses as first estimated, nan before the map began and where a frame is not placed.
+        first: number of nodes that are of a saved map.
     """
-    own = int(np.isfinite(online).all((1, 2)).sum())
-    lead, first = len(records) - own, len(end.nodes) - own
+    lead = len(records) - (len(end.nodes) - first)
     lost = [Node(record.pose, record.pose, 0.0, record.index, is_placed=False) for record in records[:lead]]
 
     def told(node: Node, record: FrameRecord, pose: np.ndarray) -> Node:
         covariance = None if record.covariance is None else np.array(record.covariance)
         noise = record.depth_noise if record.status == "tracked" else None
+        pose = pose if np.isfinite(pose).all() else node.pose
         return replace(node, online=pose, covariance=covariance, depth_noise=noise, origin=record.origin)
 
     known = map(told, end.nodes[first:], records[lead:], online[lead:])
@@ -101,7 +105,7 @@ def check_features(first: FinishedRun, other: FinishedRun) -> None:
     is_one_space = one.model == two.model and one.vectors.shape[1] == two.vectors.shape[1]
     if is_one_space:
         is_same_name = np.array([[a == b for b in two.names] for a in one.names])
-        is_same_vector = (one.vectors[:, None] == two.vectors).all(-1)
+        is_same_vector = np.isclose(one.vectors[:, None], two.vectors, atol=1e-5).all(-1)
         is_one_space = (is_same_name == is_same_vector).all()
     if not is_one_space:
         raise ValueError(
@@ -213,10 +217,11 @@ def _origin(parts: Sequence[FinishedRun], has_truth: bool) -> tuple[dict[str, An
     images |= {"runs": [str(one.folder.resolve()) for one in parts]}
     settings |= {"dataset": images, "map": None, "on_bad_frame": "error"}
     settings["densify"] |= {"points": "map"}  # those of the frames are not kept
-    settings["masks"] |= {"folder": None}  # each run has its own
+    if "masks" in settings:
+        settings["masks"] |= {"folder": None, "classes": None, "names": None}  # each run has its own
     try:
         dataset, note = build_dataset(OmegaConf.create(settings)), ""
-    except (ValueError, OSError) as error:
+    except (ValueError, OSError, InstantiationException) as error:
         dataset, note = None, f"colours are those of the Gaussians, for images are gone: {message_of(error)}"
     data = {key: joined_name(one.provenance["data"][key] for one in parts) for key in OF_DATA}
     size, intrinsics = common_camera([_camera_of(one) for one in parts])

@@ -97,7 +97,8 @@ def polish(
             targets.append(target_of(*seen(row)))
         views = Views(targets, run.poses[held], _spreads(run, held, config), all_gains[held])
         poses[held] = place_on_splats(anchors, fitted, views, run.camera, config)
-        save_trajectory_tum(run.folder / PATH_FILE, [line["timestamp"] for line in run.frames], poses)
+        placed = np.flatnonzero(run.is_placed)
+        save_trajectory_tum(run.folder / PATH_FILE, [run.frames[row]["timestamp"] for row in placed], poses[placed])
     splats, opacity = gaussians_of(anchors, fitted)
     count = _save_splats(run, splats, opacity, nearest)
     metrics = {"polish/num_splats": count, "polish/num_fitted": len(fitted_rows), "polish/num_held_out": len(held)}

@@ -84,7 +84,7 @@ def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any
             f"{', '.join(shots.names[:3])}, …; names count without folder and suffix"
         )
     for model in models:
-        resize(model, shots.size, key)
+        resize(model, shots, key)
         one_camera(model, shots.names, key)
     return models
 
@@ -107,14 +107,20 @@ def take_camera(database: Path, shots: Shots, key: str) -> None:
             opened.update_camera(known)
 
 
-def resize(model: Any, size: tuple[int, int], key: str) -> None:
-    """Bring the cameras and keypoints of a model to images of this (width, height).
+def in_use(model: Any, names: Sequence[str]) -> list[Any]:
+    """The images of a model that have a pose and one of these names."""
+    return [image for image in model.images.values() if image.has_pose and stem(image.name) in {*names}]
+
+
+def resize(model: Any, shots: Shots, key: str) -> None:
+    """Bring the cameras and keypoints of a model to images of the size of these.
 
     Raises:
         ValueError: its images have another shape.
     """
-    scales = {}
-    for number, camera in model.cameras.items():
+    scales, size = {}, shots.size
+    for number in {image.camera_id for image in in_use(model, shots.names)}:
+        camera = model.cameras[number]
         before = camera.width, camera.height
         check_shape(before, size, key)
         if before != tuple(size):
@@ -140,8 +146,7 @@ def one_camera(model: Any, names: Sequence[str], key: str) -> None:
     Raises:
         ValueError: they are of different cameras.
     """
-    images = [image for image in model.images.values() if image.has_pose and stem(image.name) in names]
-    cameras = {image.camera_id: image.camera for image in images}
+    cameras = {image.camera_id: image.camera for image in in_use(model, names)}
     if len(cameras) < 2:
         return
     focal = np.array([camera.mean_focal_length() for camera in cameras.values()])

@@ -89,7 +89,8 @@ def to_structure(models: Sequence[Any], names: Sequence[str], config: StructureC
 
 def _is_usual(structure: Structure) -> bool:
     """Test whether the unit of a model that is given can stay, and say what becomes of it."""
-    depths = [np.median(structure.depths(frame)) for frame in np.flatnonzero(structure.is_placed)]
+    shown = (structure.depths(frame) for frame in np.flatnonzero(structure.is_placed))
+    depths = [np.median(depths) for depths in shown if len(depths)]
     median, (low, high) = float(np.median(depths)) if depths else 1.0, USUAL
     if low <= median <= high:
         tqdm.write(f"prior.structure.model: its unit stays (its images look {median:.3g} far, in the median)")

@@ -12,6 +12,7 @@ from emgs_jax.data.camera_models import PERSPECTIVE, Calibration, from_colmap, t
 from emgs_jax.data.intrinsics import Pictures, from_exif
 from emgs_jax.data.masks import image_names, names_of
 from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.given import in_use
 from emgs_jax.structure.model import Structure, to_structure
 from emgs_jax.structure.reconstruct import Shots
 from emgs_jax.structure.store import make_models, models_of
@@ -49,10 +50,10 @@ def calibrate(
     camera = config.camera_model, start
     shots = Shots(names, pictures.read, pictures.size, camera, is_calibrated=False, mask=mask)
     key, models = make_models(shots, config, folder)
-    image = next(image for image in models[0].images.values() if image.has_pose)
+    model = max(models, key=lambda one: len(in_use(one, names)))
+    image, *_ = images = in_use(model, names)
     camera = from_colmap(image.camera.model_name, [*image.camera.params], pictures.size, "COLMAP's self-calibration")
-    count = models[0].num_reg_images()
-    error = models[0].compute_mean_reprojection_error()
+    count, error = len(images), model.compute_mean_reprojection_error()
     note = (
         f"intrinsics estimated by COLMAP from {count} of {pictures.count} images: {image.camera.model_name} "
         f"{[round(float(value), 4) for value in image.camera.params]}, reprojection error {error:.2f} px"

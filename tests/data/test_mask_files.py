@@ -156,6 +156,17 @@ def test_masks_of_nerfstudio_count_where_no_others_are_given(tmp_path):
     assert not any(frame.mask.any() for frame in chosen)
 
 
+def test_a_run_is_of_the_contents_of_its_masks_and_an_empty_path_is_none(tmp_path):
+    data = nerfstudio(tmp_path / "data", None)
+    before = ReadableFrames(data).fingerprint()
+    write(tmp_path / "data/own/m1.png", np.full((HEIGHT, WIDTH), 255, np.uint8))
+    assert ReadableFrames(data).fingerprint() != before
+    path = tmp_path / "data/transforms.json"
+    path.write_text(path.read_text().replace("own/m1.png", "").replace("own/m2.png", "own\\\\m2.png"))
+    frames = ReadableFrames(Nerfstudio(str(tmp_path / "data")))
+    assert frames[1].mask is None and frames[2].mask.any()
+
+
 def test_masks_that_are_those_of_other_frames_are_refused(tmp_path):
     (data, masks), flat = (tmp_path / "v", tmp_path / "m"), tmp_path / "flat"
     walk = video(data, masks, start=2, stop=8)

@@ -108,3 +108,35 @@ def test_a_database_is_mapped_by_the_camera_that_is_known_and_says_so(tmp_path, 
         assert camera.params[0] == pytest.approx(FOCAL * size[0] / SIZE[0]) and camera.width == size[0]
         assert found.num_reg_images() == NUM and found.compute_mean_reprojection_error() < 0.01
     assert "focal length of 500.0 px counts, not its own of 768.0" in "".join(capsys.readouterr())
+
+
+def test_images_that_are_not_in_use_or_show_no_point_change_nothing(tmp_path, capsys):
+    """Symptoms: a metric model lost its unit by an image without points; a camera that no image in use has counted."""
+    model = scene(2)
+    names = names_of(model)
+    for number, camera in enumerate(sorted(model.cameras.values(), key=lambda one: one.camera_id)):
+        if number:
+            camera.width, camera.height, camera.params = 300, 500, [9 * FOCAL, 9 * FOCAL, 150.0, 250.0]
+    first = min(model.cameras)
+    used = sorted(stem(image.name) for image in model.images.values() if image.camera_id == first)
+    bare = next(image for image in model.images.values() if stem(image.name) == used[0])
+    for point in [point.point3D_id for point in bare.points2D if point.has_point3D()]:
+        model.delete_point3D(point)
+    model.write_binary(tmp_path)
+    config, shots = replace(structure_config(), model=str(tmp_path)), taken(used)
+    found = to_structure(given_models(tmp_path, shots, config), used, config)
+    assert "its unit stays" in "".join(capsys.readouterr()) and len(used) == NUM // 2 < len(names)
+    assert found.worlds[0].camera.params[0] == FOCAL
+
+
+def test_the_camera_that_is_estimated_is_of_the_images_in_use(tmp_path, monkeypatch):
+    model = scene(2)
+    for number, camera in enumerate(sorted(model.cameras.values(), key=lambda one: one.camera_id)):
+        camera.params = [FOCAL * (1 + number), FOCAL * (1 + number), 320.0, 240.0]
+    model.write_binary(tmp_path)
+    for number, key in enumerate(sorted(model.cameras)):
+        used = sorted(stem(image.name) for image in model.images.values() if image.camera_id == key)
+        monkeypatch.setattr(sequence, "image_names", lambda *_, used=used: used)
+        pictures = Pictures(SIZE, len(used), lambda _: np.zeros((480, 640, 3), np.uint8))
+        camera, about = sequence.calibrate(pictures, replace(structure_config(), model=str(tmp_path)))
+        assert camera.intrinsics[0] == FOCAL * (1 + number) and about["num_images"] == len(used)
