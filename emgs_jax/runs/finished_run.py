@@ -88,8 +88,10 @@ def read_run(folder: Path) -> FinishedRun:
     lines = _lines(folder / FRAMES_FILE)
     frames = [line for line in lines if line.get("pose") is not None]
     placed = [row for row, line in enumerate(frames) if line["status"] not in UNPLACED]
-    _, path = load_trajectory_tum(folder / "trajectory.txt")
-    path = path[placed] if len(path) == len(frames) else path  # earlier versions wrote guesses, too
+    times, path = load_trajectory_tum(folder / "trajectory.txt")
+    taken = np.array([line.get("timestamp", np.nan) for line in frames], np.float64)
+    if len(path) == len(frames) and np.allclose(times, taken, atol=1e-5):  # earlier versions wrote guesses, too
+        path = path[placed]
     if len(placed) != len(path):
         counts = f"frames.jsonl has {len(placed)} frames that are placed and trajectory.txt {len(path)}"
         raise ValueError(f"{folder}: {counts}: they are of two runs, or one was cut off; run again")

@@ -26,13 +26,16 @@ ALL = ExportConfig(("colmap", "nerfstudio", "frustums"), 40, None, None)
 LOST = 3  # row of the lost frame of a written run
 
 
+OWN = np.indices((SIZE[1], SIZE[0]))[1] < 4  # what a mask of the user's leaves out of frame 1
+
+
 class Shown:
     """Images that name their frame."""
 
     def __getitem__(self, row: int):
         image = np.full((SIZE[1], SIZE[0], 3), 40 * row, np.uint8)
         image[:, :, 0] = 255  # red, so that channels cannot be swapped
-        return type("Frame", (), {"image": image})()
+        return type("Frame", (), {"image": image, "mask": OWN if row == 1 else None})()
 
 
 def a_run(folder):
@@ -75,7 +78,7 @@ def test_pycolmap_reads_the_cameras_where_they_are(written):
     np.testing.assert_allclose(camera.cam_from_img([0.5, 0.5])[0], -INTRINSICS[2] / INTRINSICS[0], rtol=1e-6)
 
 
-def test_masks_of_what_moves_have_the_names_that_other_programs_look_for(tmp_path):
+def test_masks_of_what_moves_and_of_the_user_have_the_names_that_other_programs_look_for(tmp_path):
     run = a_run(tmp_path)
     half = {"size": [SIZE[1], SIZE[0]], "counts": [0, SIZE[0] * SIZE[1] // 2, SIZE[0] * SIZE[1] // 2]}
     run.frames[1]["moving_pixels"] = half
@@ -87,6 +90,7 @@ def test_masks_of_what_moves_have_the_names_that_other_programs_look_for(tmp_pat
         for mask in (cv2.imread(str(path), cv2.IMREAD_GRAYSCALE) for path in ours):
             expected = np.full(SIZE[::-1], 255)
             expected[: SIZE[1] // 2] *= number != 1
+            expected[OWN & (number == 1)] = 0
             np.testing.assert_array_equal(mask, expected)
 
 
