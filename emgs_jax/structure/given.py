@@ -109,7 +109,8 @@ def take_camera(database: Path, shots: Shots, key: str) -> None:
 
 def in_use(model: Any, names: Sequence[str]) -> list[Any]:
     """The images of a model that have a pose and one of these names."""
-    return [image for image in model.images.values() if image.has_pose and stem(image.name) in {*names}]
+    wanted = {*names}
+    return [image for image in model.images.values() if image.has_pose and stem(image.name) in wanted]
 
 
 def resize(model: Any, shots: Shots, key: str) -> None:

@@ -50,8 +50,8 @@ def calibrate(
     camera = config.camera_model, start
     shots = Shots(names, pictures.read, pictures.size, camera, is_calibrated=False, mask=mask)
     key, models = make_models(shots, config, folder)
-    model = max(models, key=lambda one: len(in_use(one, names)))
-    image, *_ = images = in_use(model, names)
+    model, images = max(((one, in_use(one, names)) for one in models), key=lambda pair: len(pair[1]))
+    image = images[0]
     camera = from_colmap(image.camera.model_name, [*image.camera.params], pictures.size, "COLMAP's self-calibration")
     count, error = len(images), model.compute_mean_reprojection_error()
     note = (
