@@ -46,7 +46,7 @@ class Solved:
 class PosedImages(Straightened):
     """Base of the data sets with poses; images in natural order of folders and names."""
 
-    _flags = reading.AS_STORED
+    is_turned, _flags = False, reading.AS_STORED
 
     def _take(self, folder: Path, solved: Solved) -> None:
         order, times, note = in_order(solved)

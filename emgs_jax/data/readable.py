@@ -11,7 +11,7 @@ import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.masks import MANY, Masks, files_of, masked
-from emgs_jax.data.reading import AS_STORED, read_bytes
+from emgs_jax.data.reading import read_bytes
 from emgs_jax.data.spool import Spool
 
 MAX_KEPT_BYTES = 2**30  # of cached frames, uncompressed; others are read again
@@ -114,9 +114,8 @@ class ReadableFrames:
         if self._mask_files[index] is None:
             return None
         mask, image = self._mask_files[index]
-        if getattr(self._dataset, "_flags", 0) & AS_STORED:  # these images are not turned, whatever their EXIF says
-            image = None
-        is_out = self._masks.decoded(mask, self._dataset.raw_size, image)
+        turned = image if getattr(self._dataset, "is_turned", True) else None
+        is_out = self._masks.decoded(mask, self._dataset.raw_size, turned)
         return self._masks.fitted(self._dataset.straight(index, is_out), size)
 
     def pose(self, index: int) -> np.ndarray | None:

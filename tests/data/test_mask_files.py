@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.images import Images
 from emgs_jax.data.masks import Masks
 from emgs_jax.data.posed_images import Colmap, Nerfstudio
@@ -165,6 +166,18 @@ def test_a_run_is_of_the_contents_of_its_masks_and_an_empty_path_is_none(tmp_pat
     path.write_text(path.read_text().replace("own/m1.png", "").replace("own/m2.png", "own\\\\m2.png"))
     frames = ReadableFrames(Nerfstudio(str(tmp_path / "data")))
     assert frames[1].mask is None and frames[2].mask.any()
+
+
+def test_a_mask_of_the_upright_image_is_refused_where_images_are_taken_as_they_are_stored(tmp_path):
+    """Symptom: it was turned by 180 degrees and taken."""
+    data, root = nerfstudio(tmp_path / "data", tmp_path / "masks"), tmp_path / "data"
+    for row in range(COUNT):
+        exif = Image.Exif()
+        exif[0x0112] = 6
+        Image.fromarray(picture(row)).save(root / f"images/{row:04d}.png", exif=exif)
+        write(tmp_path / f"masks/{row:04d}.png", np.rot90(mask_of(row), 3))
+    with pytest.raises(BadFrameError, match="it is turned: make it of that size"):
+        ReadableFrames(data, masks=Masks(str(tmp_path / "masks")))
 
 
 def test_masks_that_are_those_of_other_frames_are_refused(tmp_path):
