@@ -78,9 +78,9 @@ def map_sequence(config: RunConfig, show_progress: bool = True, **stages: Stage)
     )
     with (
         Clock().watching() as clock,
-        tqdm(total=len(dataset), unit="frame", desc="mapping", disable=not show_progress) as bar,
+        tqdm(total=dataset.total, unit="frame", desc="mapping", disable=not show_progress) as bar,
     ):
         run = start = new_run(dataset, slam, clock, graph=config.graph, saved=saved)
         for run, new, _ in map_frames(start, dataset, prior):
-            show_records(bar, run.records, len(new))
+            show_records(bar, run.records, len(new), dataset.progress_words)
         return finish_run(run)

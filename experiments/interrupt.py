@@ -9,7 +9,7 @@ import sys
 import threading
 import weakref
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from types import FrameType
 
 
@@ -93,3 +93,23 @@ def clear_interrupt() -> Iterator[None]:
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
+
+
+@contextlib.contextmanager
+def cameras_first(end_all: Callable[[], bool]) -> Iterator[None]:
+    """Let Ctrl-C end the cameras that are running, so that the map of their images is finished; else end the run."""
+    if signal.SIGINT not in _heard():
+        yield
+        return
+
+    def first(number: int, frame: FrameType | None) -> None:
+        if not end_all():
+            before(number, frame)
+            return
+        os.write(2, b"\nno more images are taken: the map is finished and written (Ctrl-C again stops at once)\n")
+
+    before = signal.signal(signal.SIGINT, first)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)

@@ -14,6 +14,7 @@ from tqdm import tqdm
 from emgs_jax.back_end.saved_map import load_saved_map
 from emgs_jax.config.configure import baseline_configs, build, build_dataset, build_prior, graph_config
 from emgs_jax.config.values import check_values
+from emgs_jax.data.capture import end_all
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
@@ -50,6 +51,7 @@ from emgs_jax.runs.provenance import is_metric, provenance, signature, write_met
 from emgs_jax.viewer.live import LiveView, live_view
 
 from .command import command
+from .interrupt import cameras_first
 from .shorthand import with_source
 
 
@@ -65,15 +67,20 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         raise ValueError(f"map={config.map} is the folder of this run, too: give hydra.run.dir=ANOTHER")
     with contextlib.ExitStack() as stack:
         stack.enter_context(owned(folder))
+        stack.enter_context(cameras_first(end_all))
         clock = stack.enter_context(Clock().watching())
         with clock.phase("setup"):
             slam, evaluation, densify = (build(config, name) for name in ("slam", "evaluation", "densify"))
             graph, fused = graph_config(config), baseline_configs(config)
             dataset = build_dataset(config, folder)
             prior = build_prior(config, dataset)
+            is_live = dataset.total is None
             if config.map is None:  # a saved map has its own capacity
                 num_features = prior.text_features.shape[-1]
-                stack.enter_context(prepared_beside(to_camera(dataset), num_features, slam))
+                prepared = stack.enter_context(prepared_beside(to_camera(dataset), num_features, slam))
+                if is_live:  # the images that come while programs are compiled are lost
+                    tqdm.write("compiling before the first image is taken …")
+                    prepared()
             prior.keep(folder)
             saved = load_saved_map(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
             session = new_run(dataset, slam, clock, graph=graph, saved=saved)
@@ -87,11 +94,16 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             origin = provenance(settings, dataset, prior.provenance)
             if saved is not None:
                 origin["map"] = saved.checksum
-            keeper = Keeper(folder / CHECKPOINT_FILE, build(config, "checkpoint"), signature(origin))
+            checkpoint = None if is_live else build(config, "checkpoint")  # frames that have passed do not come again
+            keeper = Keeper(folder / CHECKPOINT_FILE, checkpoint, signature(origin))
         for note in [*filter(None, [keeper.note]), *claim_folder(folder, keeper.found is not None)]:
             tqdm.write(note)
         keeps_points = dataset.has_ground_truth or densify.points == "own"
+        dataset.begin()
         session, raw = _map(session, dataset, prior, (baselines, evaluation, keeps_points), folder, keeper, live)
+        if is_live:  # all its frames are known now
+            origin = provenance(settings, dataset, prior.provenance)
+        origin["config"] |= {"dataset": dataset.recording() or settings["dataset"]}
         # The raw prior is scored while the map is drawn and written.
         with ThreadPoolExecutor(2, "raw prior") as threads:
             truth = threads.submit(new_scorer, dataset, evaluation, prior)
@@ -112,6 +124,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
                 metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer) | dense.rendering
                 metrics |= of_prior.result() | score_baselines(session, baselines, raw, scorer)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
+        metrics |= dataset.report()
     metrics["provenance"] = origin
     write_metrics(folder / "metrics.json", metrics)
     keeper.drop()
@@ -154,7 +167,7 @@ def _map(
     if keeper.found is not None:
         tqdm.write(f"resuming after frame {len(keeper.found.records)}: earlier frames are only read and predicted")
     run, (baselines, evaluation, keeps_points) = start, compared
-    with FrameLog(folder / "frames.jsonl") as log, tqdm(total=len(dataset), unit="frame", desc="mapping") as bar:
+    with FrameLog(folder / "frames.jsonl") as log, tqdm(total=dataset.total, unit="frame", desc="mapping") as bar:
 
         def frames() -> Iterator[tuple[FrameRecord, RawView]]:
             nonlocal run
@@ -162,7 +175,7 @@ def _map(
                 for run, new, views in inputs:
                     for record in new:
                         log.append(to_line(record) | {"index": dataset.kept[record.index]})
-                    show_records(bar, run.records, len(new))
+                    show_records(bar, run.records, len(new), dataset.progress_words)
                     for record, view in zip(new, views, strict=True):
                         if live is not None:
                             live.show(run, view.image)

@@ -1,15 +1,17 @@
 """`emgs run video.mp4`: the settings that a video or a folder of images implies; given keys win."""
 
-import math
 import os
+import re
 from collections.abc import Sequence
 from pathlib import Path
 
 from emgs_jax.config.overrides import written
+from emgs_jax.data.reading import about_pixels
 
 from .command import overrides_of, words_of
 
-NUM_PIXELS, SIDE = 320 * 240, 16  # of a frame, whose sides are multiples of SIDE
+CAMERA = re.compile(r"camera(:.*)?$|/dev/video\d+$|(rtsp|rtmp|http|https|udp)://")
+FPS = 3  # images a second of a camera, of which a structure is made
 NUM_FRAMES = 150  # about as many frames of a video are taken, evenly
 SECONDS = 5.0  # for an image, from COLMAP to the report, on one core
 
@@ -22,6 +24,8 @@ def with_source(arguments: list[str]) -> list[str]:
         return arguments
     if len(paths) > 1:
         raise ValueError(f"{', '.join(paths)}: give one video or folder of images, and all else as key=value")
+    if CAMERA.match(paths[0]):
+        return of_camera(paths[0], [word for word in arguments if word != paths[0]])
     path = Path(paths[0]).expanduser()
     if not path.exists():
         raise ValueError(f"{path} is no file or folder, and no key=value: emgs run --help lists the keys")
@@ -31,6 +35,21 @@ def with_source(arguments: list[str]) -> list[str]:
     if note := plan_note(path, keys_of([*found, *given])):
         print(note)
     return [*found, *given]
+
+
+def of_camera(word: str, given: list[str]) -> list[str]:
+    """Put the keys that a camera implies before the given ones, and print them."""
+    keys = keys_of(given)
+    source = word.removeprefix("camera").removeprefix(":") or "0"
+    found = {"dataset": "camera", "dataset.source": written(source)}
+    if keys.get("prior", "multiview_stereo") == "multiview_stereo":  # it needs all images before it begins
+        found |= {"prior": "multiview_stereo", "graph": "up_to_scale", "dataset.intrinsics": "estimate"}
+        found |= {"dataset.fps": str(FPS), "dataset.record": "true"}
+    words = [f"{key}={value}" for key, value in found.items() if key not in keys]
+    print(f"settings for camera {source}: {' '.join(words)} (your own win)")
+    if found.get("prior") is not None:
+        print("the images are recorded until Ctrl-C (or dataset.max_seconds=60), and mapped then")
+    return [*words, *given]
 
 
 def keys_of(arguments: Sequence[str]) -> dict[str, str]:
@@ -43,7 +62,7 @@ def implied(path: Path, given: dict[str, str]) -> list[str]:
         return [f"dataset.root={written(str(path))}"]
     found = {"dataset": "images", "dataset.root": written(str(path)), "dataset.intrinsics": "estimate"}
     size = _size(path)
-    found["dataset.size"] = "[{},{}]".format(*frame_size(*size))
+    found["dataset.size"] = "[{},{}]".format(*about_pixels(*size))
     if given.get("prior") == "files" and "prior.folder" in given and "dataset.intrinsics" not in given:
         from emgs_jax.prior.files.prior import image_intrinsics
 
@@ -89,12 +108,6 @@ def plan_note(path: Path, keys: dict[str, str]) -> str:
     less = f"; dataset.stride={2 * images.step} halves that" if len(images) > NUM_FRAMES // 2 else ""
     size = keys["dataset.size"].strip("[]").replace(",", "×")
     return f"{taken}, at {size}: about {minutes} min on this machine{less}"
-
-
-def frame_size(width: int, height: int) -> tuple[int, int]:
-    """(width, height) with the aspect of an image and about NUM_PIXELS pixels."""
-    scale = math.sqrt(NUM_PIXELS / (width * height))
-    return max(round(width * scale / SIDE), 1) * SIDE, max(round(height * scale / SIDE), 1) * SIDE
 
 
 def _size(path: Path) -> tuple[int, int]:

@@ -146,7 +146,7 @@ def room() -> tuple[Dataset, list[Frame]]:
 def read_prior(prior) -> None:
     dataset, frames = room()
     prior.check(dataset, 2)
-    for window in windows(len(dataset), 2):
+    for window in windows(range(len(dataset)).__contains__, 2):
         found = prior.predict(window, [frames[i] for i in window.views], dataset.intrinsics)
         assert found.points.shape == (len(window.dense), SIZE[1], SIZE[0], 3)
         assert np.isfinite(found.points[found.mask]).all() and (found.points[found.mask][:, 2] > 0).all()

@@ -434,7 +434,7 @@ def read_own(root: Path, names: list[str] = NAMES, folder: str | None = None, **
     prior = Files(folder or root / "own", **KEYS | keys)
     prior.check(found, tiny_run.WINDOW_SIZE)
     known = [frames.get(name, truth()[0]) for name in names]
-    calls = windows(len(found), tiny_run.WINDOW_SIZE)
+    calls = windows(range(len(found)).__contains__, tiny_run.WINDOW_SIZE)
     return len([prior.predict(call, [known[i] for i in call.views], found.intrinsics) for call in calls])
 
 
@@ -584,7 +584,7 @@ def read_recorded(root: Path, folder: str = "recording", into: str | None = None
         recorded(root, into, seed=6)
     prior, data = Recorded(root / folder), Named(names=NAMES[:stop])
     prior.check(data, size)
-    calls = windows(len(data), size)
+    calls = windows(range(len(data)).__contains__, size)
     return len([prior.predict(call, [data[i] for i in call.views], data.intrinsics) for call in calls])
 
 

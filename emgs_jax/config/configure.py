@@ -203,6 +203,8 @@ def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFra
 
         structure = folder and folder / "structure"
         given["intrinsics"] = partial(calibrate, config=structure_config(config), folder=structure)
+    if "record" in config.dataset:
+        given["folder"] = folder
     dataset = build(config, "dataset", **given)
     if "note" in dataset.calibration:
         tqdm.write(dataset.calibration["note"])

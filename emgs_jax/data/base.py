@@ -7,6 +7,7 @@ from types import MappingProxyType
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
+from tqdm import tqdm
 
 # Values of `Frame.moving`: what a pixel shows stays, moves, or will stand elsewhere.
 STAYS, MOVES, ELSEWHERE = range(3)
@@ -54,9 +55,35 @@ class Dataset(Protocol):
     is_turned: bool = True  # images are shown as their EXIF turns them; False: as they are stored
     has_ground_truth: bool = False  # depth and poses
 
-    def __len__(self) -> int: ...
+    def __len__(self) -> int:
+        """Number of frames; of a camera's, those that have come so far."""
+        ...
 
     def __getitem__(self, index: int) -> Frame: ...
+
+    def has(self, index: int) -> bool:
+        """Test whether there is a frame `index`; waits for it while more may come."""
+        return index < len(self)
+
+    @property
+    def total(self) -> int | None:
+        """Number of frames; None while more may come."""
+        return len(self)
+
+    def begin(self) -> None:
+        """Be told that mapping begins now."""
+
+    def progress_words(self, index: int) -> str:
+        """Return words for the progress bar after frame `index` is mapped."""
+        return ""
+
+    def report(self) -> dict[str, float]:
+        """Return statistics of how the frames came, as keys `camera/…`."""
+        return {}
+
+    def recording(self) -> Mapping[str, Any] | None:
+        """Return settings that read the same frames again; None if they are those of this data set, or none do."""
+        return None
 
     def full(self, index: int) -> np.ndarray:
         """RGB image of a frame, uint8, at its size on disk, undistorted. May raise BadFrameError."""
@@ -89,3 +116,11 @@ class Dataset(Protocol):
     def fingerprint(self) -> str:
         """Hex digest of all that defines the frames (names and contents of files, options), for provenance."""
         ...
+
+
+def wait_for_all(dataset: Dataset) -> int:
+    """Return the number of frames once no more come, with a progress bar where that takes time."""
+    with tqdm(initial=len(dataset), unit="image", desc="recording", disable=dataset.total is not None) as bar:
+        while dataset.has(len(dataset)):
+            bar.update()
+    return len(dataset)

@@ -3,9 +3,10 @@
 import contextlib
 import hashlib
 import itertools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -47,11 +48,11 @@ class ReadableFrames:
         for name in ("name", "sequence", "size", "intrinsics", "calibration", "classes", "has_ground_truth"):
             setattr(self, name, getattr(dataset, name))
         self.full_intrinsics = getattr(dataset, "full_intrinsics", None)
-        indices = range(len(dataset))
+        self._grows, indices = dataset.total is None, range(len(dataset))
         self._masks, self._mask_files = masks, self._files_of_masks(dataset, masks)
         self.has_masks = any(self._mask_files)
         self.skipped = _unreadable(self._read, progress(indices)) if on_bad_frame == "skip" else {}
-        self.kept = tuple(index for index in indices if index not in self.skipped)
+        self.kept = [index for index in indices if index not in self.skipped]
         if not self.kept:
             what = f"{dataset.name} {dataset.sequence}"
             first = next(iter(self.skipped.values()), "there are none")
@@ -61,6 +62,37 @@ class ReadableFrames:
 
     def __len__(self) -> int:
         return len(self.kept)
+
+    def has(self, index: int) -> bool:
+        """Test whether there is a frame `index`; waits for it while more may come."""
+        num_known = len(self.kept) + len(self.skipped)  # of the data set's
+        while index >= len(self.kept) and self._grows and self._dataset.has(num_known):
+            self.kept.append(num_known)
+            num_known += 1
+        return index < len(self.kept)
+
+    @property
+    def total(self) -> int | None:
+        """Number of frames; None while more may come."""
+        return None if self._grows and self._dataset.total is None else len(self)
+
+    def begin(self) -> None:
+        """Be told that mapping begins now."""
+        if self._grows:
+            self._places.clear()
+        self._dataset.begin()
+
+    def progress_words(self, index: int) -> str:
+        """Return words for the progress bar after frame `index` is mapped."""
+        return self._dataset.progress_words(self.kept[index])
+
+    def report(self) -> dict[str, float]:
+        """Return statistics of how the frames came, as keys `camera/…`."""
+        return self._dataset.report()
+
+    def recording(self) -> Mapping[str, Any] | None:
+        """Return settings that read the same frames again; None if they are those of this data set, or none do."""
+        return self._dataset.recording()
 
     def __getitem__(self, index: int) -> Frame:
         return replace(self._read(self.kept[index]), index=index)
@@ -111,7 +143,7 @@ class ReadableFrames:
 
     def _left_out(self, index: int, size: tuple[int, int]) -> np.ndarray | None:
         """What the mask of the data set's frame leaves out of its image in this (width, height)."""
-        if self._mask_files[index] is None:
+        if index >= len(self._mask_files) or self._mask_files[index] is None:
             return None
         mask, image = self._mask_files[index]
         turned = image if getattr(self._dataset, "is_turned", True) else None
@@ -133,7 +165,7 @@ class ReadableFrames:
         if self.has_masks:
             masks = [hashlib.sha256(read_bytes(found[0])).hexdigest() for found in self._mask_files if found]
             whole = hashlib.sha256(repr((whole, masks, self._masks.border)).encode()).hexdigest()
-        return hashlib.sha256(repr((whole, self.kept)).encode()).hexdigest() if self.skipped else whole
+        return hashlib.sha256(repr((whole, tuple(self.kept))).encode()).hexdigest() if self.skipped else whole
 
 
 def _unreadable(read: Callable[[int], Frame], indices: Iterable[int]) -> dict[int, str]:

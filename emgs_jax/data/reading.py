@@ -25,6 +25,7 @@ RIGID_TOLERANCE = 1e-2  # of R^T R, as text files round
 SAME_SURFACE = 0.05  # relative inverse-depth step between neighbouring pixels of one surface
 AS_STORED = cv2.IMREAD_IGNORE_ORIENTATION  # not turned by EXIF, as other programs do not turn either
 HEIC = {b"heic", b"heix", b"heim", b"heis", b"hevc", b"hevx", b"mif1", b"msf1", b"miaf", b"MiHE"}
+NUM_PIXELS, SIDE = 320 * 240, 16  # of a frame, whose sides are multiples of SIDE
 OWN_BITS = cv2.IMREAD_COLOR | cv2.IMREAD_ANYDEPTH  # BGR in 8 or 16 bits, or float
 EIGHT_BITS = b"\xff\xd8", b"BM", b"RIFF", b"GIF8"  # signatures of formats without more bits
 REMEDY = "fetch the file again or set on_bad_frame=skip"
@@ -113,6 +114,12 @@ def resize_intrinsics(intrinsics: Intrinsics, raw_size: Size, size: Size) -> Int
     fx, fy, cx, cy = intrinsics
     sx, sy = size[0] / raw_size[0], size[1] / raw_size[1]
     return fx * sx, fy * sy, (cx + 0.5) * sx - 0.5, (cy + 0.5) * sy - 0.5
+
+
+def about_pixels(width: int, height: int) -> tuple[int, int]:
+    """(width, height) with the aspect of an image and about NUM_PIXELS pixels."""
+    scale = math.sqrt(NUM_PIXELS / (width * height))
+    return max(round(width * scale / SIDE), 1) * SIDE, max(round(height * scale / SIDE), 1) * SIDE
 
 
 def resize_color(image: UInt8[np.ndarray, "_ _ 3"], size: Size) -> UInt8[np.ndarray, "_ _ 3"]:

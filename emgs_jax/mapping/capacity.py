@@ -2,7 +2,7 @@
 
 import contextlib
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 from dataclasses import replace
 from functools import partial
 from threading import Event, Lock
@@ -116,8 +116,10 @@ def prepare_step(
 
 
 @contextlib.contextmanager
-def prepared_beside(camera: Camera, num_features: int, config: SlamConfig) -> Iterator[None]:
+def prepared_beside(camera: Camera, num_features: int, config: SlamConfig) -> Iterator[Callable[[], None]]:
     """Run `prepare_step` in the background of a block that reads and predicts the first frames.
+
+    Yields a function that waits until it has ended.
 
     Args:
         camera: of the full images.
@@ -130,9 +132,9 @@ def prepared_beside(camera: Camera, num_features: int, config: SlamConfig) -> It
     views = jax.eval_shape(jax.vmap(lambda *arrays: observe(*arrays, config.observation)), *image)
     ended = Event()
     with ThreadPoolExecutor(1, "compilation") as thread:
-        thread.submit(prepare_step, views, camera, config, lambda: not ended.is_set())
+        preparing = thread.submit(prepare_step, views, camera, config, lambda: not ended.is_set())
         try:
-            yield
+            yield partial(wait, [preparing])
         finally:
             ended.set()
 

@@ -4,7 +4,7 @@ A pose is a (4, 4) float64 matrix, camera -> world, everywhere on the host; file
 """
 
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -315,12 +315,18 @@ def _last_row(records: Sequence[FrameRecord], most: int) -> Sequence[FrameRecord
     return records[len(records) - count :]
 
 
-def show_records(bar: tqdm, records: Sequence[FrameRecord], num_new: int) -> None:
-    """Advance the progress bar by the new records, and print an alarm if many frames in a row are untracked."""
+def show_records(
+    bar: tqdm, records: Sequence[FrameRecord], num_new: int, words_of: Callable[[int], str] = lambda index: ""
+) -> None:
+    """Advance the progress bar by the new records, and print an alarm if many frames in a row are untracked.
+
+    `words_of` gives what is to be said of a frame beside its outcome.
+    """
     for count in range(len(records) - num_new + 1, len(records) + 1):
         message = None if bar.disable else alarm(records[:count])
         if message is not None:
             tqdm.write(message)
         last = records[count - 1]
-        bar.set_postfix_str(f"{last.status}, {last.num_gaussians or 0} Gaussians", refresh=False)
+        words = [last.status, f"{last.num_gaussians or 0} Gaussians", words_of(last.index)]
+        bar.set_postfix_str(", ".join(filter(None, words)), refresh=False)
         bar.update()

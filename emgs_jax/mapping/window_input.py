@@ -14,7 +14,7 @@ from emgs_jax.loop_closure.prior_query import JointPrediction, PriorQuery
 from emgs_jax.mapping.convert import FirstWindow, opening, to_first_window, to_prediction
 from emgs_jax.observation import Prediction
 from emgs_jax.ops.ranges import MAX_LENGTH_M
-from emgs_jax.prior.base import Prior, PriorPrediction, check_unit, visits, windows, with_frames
+from emgs_jax.prior.base import Prior, PriorPrediction, calls_of, check_unit, visits, with_frames
 from emgs_jax.slam import SlamConfig
 
 
@@ -104,7 +104,7 @@ def predictions(
     dataset: Dataset, prior: Prior, window_size: int, clock: Clock
 ) -> Iterator[tuple[PriorPrediction, dict[int, Frame]]]:
     """Predict window by window; read a frame when a window needs it, and drop it when none does."""
-    calls = windows(len(dataset), window_size, prior.num_newer(window_size))
+    calls = calls_of(prior, dataset, window_size)
     for window, frames in clock.each("load", with_frames(calls, dataset)):
         with clock.phase("predict"):
             prediction = prior.predict(window, list(frames.values()), dataset.intrinsics)

@@ -1,7 +1,8 @@
 """Interface of a prior: it predicts the poses of a window of images, and dense geometry of some of them."""
 
+import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -93,6 +94,10 @@ class Prior(ABC):
         """Number of images after the current one in a window, see `windows`; live frames are mapped that much later."""
         return 1
 
+    def num_first(self, window_size: int) -> int:
+        """Number of images in the first window, which a camera must have given before anything is mapped."""
+        return window_size
+
     def check(self, dataset: Dataset, window_size: int) -> None:  # noqa: B027 (most can answer for any data set)
         """Raise ValueError if the prior cannot predict for the data set."""
 
@@ -125,24 +130,36 @@ def check_unit(prediction: PriorPrediction) -> None:
         )
 
 
-def windows(num_frames: int, window_size: int, num_newer: int = 1) -> Iterator[Window]:
+def windows(
+    has: Callable[[int], bool], window_size: int, num_newer: int = 1, num_first: int | None = None
+) -> Iterator[Window]:
     """Yield the calls of a sequence: one that fills the FIFO, then one for each further frame.
 
     A window has the anchor, the current image, `num_newer` after it (fewer at the end) and those before it, at most
     `window_size` + 2 in all, each once. More newer images give the same windows with an older current image.
+
+    Args:
+        has: whether there is a frame of this index, see `Dataset.has`; it may wait for a camera.
+        num_first: images of the first call; None: `window_size`.
     """
     if not isinstance(window_size, int) or window_size < 1:
         raise ValueError(f"slam.window_size must be a whole number of images, 1 or more, got {window_size}")
-    if not 1 <= num_newer <= window_size:
+    if not 0 <= num_newer <= window_size:
         raise ValueError(f"a window of {window_size} images cannot have {num_newer} after the current one")
-    first = tuple(range(min(window_size, num_frames)))
-    dense = first[: max(len(first) - num_newer + 1, 1)]
+    first = tuple(itertools.takewhile(has, range(window_size if num_first is None else num_first)))
+    dense = first[: max(len(first) - max(num_newer, 1) + 1, 1)]
     if first:
         yield Window(0, first, dense, dense[-1])
-    for inference, current in enumerate(range(len(dense), num_frames), start=1):
-        newest = min(current + num_newer, num_frames)
-        recent = range(max(newest - window_size - 1, 0), min(newest + 1, num_frames))
+    for inference, current in enumerate(itertools.takewhile(has, itertools.count(len(dense))), start=1):
+        newer = range(current + 1, current + num_newer + 1)
+        newest = next((index for index in newer if not has(index)), current + num_newer)
+        recent = [index for index in range(max(newest - window_size - 1, 0), newest + 1) if has(index)]
         yield Window(inference, tuple(dict.fromkeys((0, *recent))), (current - 1, current), current)
+
+
+def calls_of(prior: Prior, dataset: Dataset, window_size: int) -> Iterator[Window]:
+    """Yield the calls of a prior for a data set, see `windows`."""
+    return windows(dataset.has, window_size, prior.num_newer(window_size), prior.num_first(window_size))
 
 
 def visits(a: int, b: int, spacing: int, window_size: int) -> Window:

@@ -32,10 +32,10 @@ from emgs_jax.prior.base import (
     PriorPrediction,
     Provenance,
     Window,
+    calls_of,
     check_pose_std,
     check_unit,
     equal_covariances,
-    windows,
     with_frames,
 )
 
@@ -112,7 +112,7 @@ def record(
 ) -> None:
     """Write the predictions of every window of a data set, keeping those that exist; `progress` is tqdm or the like."""
     folder = Path(folder)
-    calls = list(windows(len(dataset), window_size, prior.num_newer(window_size)))
+    calls = list(calls_of(prior, dataset, window_size))
     header = {
         "format": FORMAT,
         "version": VERSION,

@@ -13,7 +13,7 @@ from emgs_jax.loop_closure.place_recognition import (
     propose_candidates,
 )
 from emgs_jax.loop_closure.two_view_alignment import AlignmentConfig, RefusedError, align
-from emgs_jax.prior.base import Prior, Window, visits, windows, with_frames
+from emgs_jax.prior.base import Prior, Window, calls_of, visits, with_frames
 from emgs_jax.prior.recorded import Recorded, add_visits, visits_file
 
 
@@ -31,7 +31,7 @@ def places_seen_twice(
     `slam.initialization=merged`), it may find others, which are not recorded.
     """
     database, pairs, seen = Database(), [], set()
-    calls = list(windows(len(dataset), window_size, replay.num_newer(window_size)))
+    calls = list(calls_of(replay, dataset, window_size))
     for window, frames in with_frames(progress(calls), dataset):
         prediction = replay.predict(window, list(frames.values()), dataset.intrinsics)
         for row, index in enumerate(window.dense):

@@ -22,6 +22,9 @@ class Wrapped(Prior):
     def num_newer(self, window_size: int) -> int:
         return self._prior.num_newer(window_size)
 
+    def num_first(self, window_size: int) -> int:
+        return self._prior.num_first(window_size)
+
     def keep(self, folder: Path) -> None:
         self._prior.keep(folder)
 

@@ -36,7 +36,7 @@ def settings(*words: str):
 def walk(numbers, *words: str) -> ReadableFrames:
     """Frames of the path in any order."""
     frames = ReadableFrames(build_dataset(settings(*words))._dataset)
-    frames.kept = tuple(numbers)
+    frames.kept = [*numbers]
     return frames
 
 

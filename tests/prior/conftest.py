@@ -5,10 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from emgs_jax.data.base import Frame
+from emgs_jax.data.base import Dataset, Frame
 
 
-class Room:
+class Room(Dataset):
     """A `Dataset` of depth images that need no rendering; wall at 3 m, box at 2 m, a patch without depth."""
 
     name, sequence, classes, has_ground_truth = "room", "one", ("wall", "box"), True

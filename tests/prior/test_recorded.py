@@ -40,7 +40,10 @@ def folder(tmp_path, room):
 
 
 def calls(dataset):
-    return [(window, [dataset[i] for i in window.views]) for window in windows(len(dataset), WINDOW_SIZE)]
+    return [
+        (window, [dataset[i] for i in window.views])
+        for window in windows(range(len(dataset)).__contains__, WINDOW_SIZE)
+    ]
 
 
 def contents(folder):

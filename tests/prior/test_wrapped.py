@@ -40,7 +40,7 @@ def textured(room):
 
 
 def predictions(prior, dataset):
-    for window in windows(len(dataset), WINDOW_SIZE):
+    for window in windows(range(len(dataset)).__contains__, WINDOW_SIZE):
         yield prior.predict(window, [dataset[i] for i in window.views], dataset.intrinsics)
 
 
@@ -59,7 +59,7 @@ def test_geometry_is_bit_identical_and_features_are_the_models_which_describes_e
 
 def test_another_image_of_the_same_number_is_described_anew(textured):
     model = make_model()
-    prior, window = Featured(Simulated(), model), next(windows(1, 1))
+    prior, window = Featured(Simulated(), model), next(windows(range(1).__contains__, 1))
     first, second = (replace(textured[index], index=0) for index in (0, 1))
     prior.predict(window, [first], textured.intrinsics)
     features = prior.predict(window, [second], textured.intrinsics).features[0]

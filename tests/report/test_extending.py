@@ -38,7 +38,7 @@ def test_a_data_set_and_a_prior_of_ones_own_are_options_of_every_command(mine):
     config = compose(*words)
     dataset = build_dataset(config)
     prior = build_prior(config, dataset)
-    window = next(windows(len(dataset), 3))
+    window = next(windows(range(len(dataset)).__contains__, 3))
     found = prior.predict(window, [dataset[view] for view in window.views], dataset.intrinsics)
     assert prior.provenance.settings == {"depth": 3.0} and found.mask.all() and found.points.shape == (3, 24, 32, 3)
     np.testing.assert_allclose(found.points[1, 5, 7], [3 * (7 - 15.5) / 40, 3 * (5 - 11.5) / 40, 3.0], rtol=1e-6)

@@ -216,7 +216,7 @@ def test_a_run_is_described_by_its_counts():
     run.records[1] = dataclasses.replace(run.records[1], overflow=3)
     run.records[4] = dataclasses.replace(run.records[4], overflow=4)
     room = Room()
-    room.kept = (0, 1, 5, 6, 7, 8)
+    room.kept = [0, 1, 5, 6, 7, 8]
     metrics = describe(run, room)
     counts = {"tracked": 3, "degraded": 1, "lost": 1, "initialization": 1, "skipped": 1, "overflow": 7}
     assert {name: metrics[f"frames/{name}"] for name in counts} == counts

@@ -6,8 +6,9 @@ import pytest
 from PIL import ExifTags, Image
 
 from emgs_jax.config.configure import compose
+from emgs_jax.data.reading import about_pixels
 from experiments.command import check_arguments
-from experiments.shorthand import frame_size, keys_of, with_source
+from experiments.shorthand import keys_of, with_source
 
 pytestmark = pytest.mark.slow
 
@@ -126,7 +127,7 @@ def test_a_folder_without_images_is_a_clear_error(tmp_path):
 
 @pytest.mark.parametrize("size", [(640, 480), (1920, 1080), (1080, 1920), (4032, 3024), (50, 2000)])
 def test_frames_keep_the_shape_of_the_image_and_have_as_many_pixels_as_those_of_the_data_sets(size):
-    width, height = frame_size(*size)
+    width, height = about_pixels(*size)
     assert width % 16 == height % 16 == 0
     rounding = (8 / np.array([width, height])).sum() * 1.2  # of both sides to the next multiple, in a logarithm
     assert abs(np.log(width / height * size[1] / size[0])) <= rounding

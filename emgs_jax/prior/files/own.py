@@ -34,12 +34,12 @@ def read_own(folder: Path, units_per_metre: float) -> Predictions:
     if lists:
         poses, source = _listed_poses(lists[0], names), str(lists[0])
     elif suffix == ".npz":
-        poses, source = np.concatenate([_own_pose(path) for path in paths]), f"T_world_camera of {folder}/*.npz"
+        poses, source = np.concatenate([own_pose(path) for path in paths]), f"T_world_camera of {folder}/*.npz"
     else:
         raise ValueError(f"{folder} has {len(paths)} files *{suffix} and neither of {', '.join(POSES)}: {GIVES_POSES}")
     if suffix == ".npz":
         unread = tuple(name for name in names_in(paths[0]) if name not in (*KEYS, "T_world_camera"))
-        read_npz, files = (lambda row: _read_npz(paths[row])), paths + lists
+        read_npz, files = (lambda row: read_npz_view(paths[row])), paths + lists
         return Predictions("npz", names, poses, source, read_npz, files, True, whole_image, unread=unread)
     given = load_json(lists[0]).get("intrinsics") if lists[0].suffix == ".json" else None
     intrinsics = None if given is None else as_intrinsics(given, f"{lists[0]}: intrinsics")
@@ -52,7 +52,7 @@ def read_own(folder: Path, units_per_metre: float) -> Predictions:
     return Predictions(suffix[1:], names, poses, source, read, paths + lists, True, whole_image)
 
 
-def _own_pose(path: Path) -> np.ndarray:
+def own_pose(path: Path) -> np.ndarray:
     """The pose (1, 4, 4) of an .npz."""
     if "T_world_camera" not in names_in(path):
         load_npz(path)  # where it is no .npz at all
@@ -60,7 +60,7 @@ def _own_pose(path: Path) -> np.ndarray:
     return as_poses(load_npz(path, ("T_world_camera",))["T_world_camera"][None], f"{path}: T_world_camera")
 
 
-def _read_npz(path: Path) -> View:
+def read_npz_view(path: Path) -> View:
     found = load_npz(path, (), KEYS)
     if ("depth" in found) == ("points" in found):
         raise ValueError(f"{path} must have depth or points, one of them; it has {', '.join(names_in(path))}")

@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from emgs_jax.data.base import Dataset, Frame
+from emgs_jax.data.base import Dataset, Frame, wait_for_all
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
@@ -80,7 +80,7 @@ class MultiviewStereo(Prior):
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Take the data set; ValueError if it has fewer than three images, or the depths are not of them."""
-        if len(dataset) < 3:
+        if wait_for_all(dataset) < 3:
             raise ValueError(
                 f"prior=multiview_stereo needs three images or more of one place, {dataset.name} {dataset.sequence} "
                 f"has {len(dataset)} in use: give more (dataset.stop, dataset.stride)"

@@ -70,7 +70,7 @@ def asked(folder: Path, data: Named | None = None, **keys) -> tuple[Files, list[
     data = Named() if data is None else data
     prior = Files(folder, **(KEYS | keys))
     prior.check(data, tiny_run.WINDOW_SIZE)
-    calls = windows(len(data), tiny_run.WINDOW_SIZE)
+    calls = windows(range(len(data)).__contains__, tiny_run.WINDOW_SIZE)
     return prior, [prior.predict(call, [data[i] for i in call.views], data.intrinsics) for call in calls]
 
 

@@ -27,7 +27,7 @@ def ask(prior, data, window):
 
 
 def calls(data):
-    return list(windows(len(data), WINDOW_SIZE))
+    return list(windows(range(len(data)).__contains__, WINDOW_SIZE))
 
 
 def same_bits(a, b):

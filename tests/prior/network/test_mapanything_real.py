@@ -36,7 +36,7 @@ def predict(checkpoint, *overrides):
     names = (f"prior.checkpoint={checkpoint}", "prior.resolution=[84,56]", *(f"prior.{key}" for key in keys))
     prior = hydra.utils.instantiate(compose("prior=mapanything", *names).prior)
     data = Sphere(num_frames=4, size=(60, 40))
-    calls = list(windows(len(data), 3))
+    calls = list(windows(range(len(data)).__contains__, 3))
     return [prior.predict(window, [data[i] for i in window.views], data.intrinsics) for window in calls]
 
 

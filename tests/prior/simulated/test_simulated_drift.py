@@ -30,7 +30,7 @@ def window_errors(step, inference=9, version=2, level=1.0, seeds=SEEDS):
 
 def test_while_the_anchor_is_seen_only_the_walk_of_the_scale_is_new(room):
     """The same bits but for one factor, which multiplies points and translations alike; without the two, the same."""
-    for window in windows(len(room), 3):
+    for window in windows(range(len(room)).__contains__, 3):
         first, second = (ask(Simulated(seed=3, version=v, classes=room.classes), room, window) for v in (1, 2))
         factor = math.exp(0.003 * random_walk(3, window.inference))
         np.testing.assert_array_equal(second.T_anchor_view[:, :3, :3], first.T_anchor_view[:, :3, :3])

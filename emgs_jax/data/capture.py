@@ -1,0 +1,169 @@
+"""Images as they come: from a camera, an address of a stream, or a recording that is played in real time.
+
+A thread waits for the images and keeps the newest one until the map takes it: a queue would fall behind.
+"""
+
+import os
+import threading
+import time
+import weakref
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+
+from emgs_jax.data.images import listed
+from emgs_jax.data.tones import read_shown
+from emgs_jax.data.video import VIDEO_SUFFIXES, Video
+from emgs_jax.io.npz import read_npz
+
+# Streams over TCP, each image as it comes: otherwise OpenCV lags by seconds (opencv#13145).
+RTSP_OPTIONS = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
+GIVEN = ("depth", "T_world_camera", "intrinsics", "confidence")  # arrays beside an image, as in files of prior=files
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One image of a camera.
+
+    Args:
+        time: seconds, of the camera's own clock where it has one.
+        image: RGB, uint8 (h, w, 3).
+        given: what came with it, by the names in `GIVEN`: depth (h', w') in metres, 0 = none; T_world_camera (4, 4),
+            NaN where unknown; intrinsics of the depth, without them those of the image.
+        arrived: of `time.monotonic`.
+    """
+
+    time: float
+    image: np.ndarray
+    given: dict[str, np.ndarray] | None = None
+    arrived: float = 0.0
+
+
+class Newest:
+    """The newest image of a source, until it is taken; those that newer ones replace are counted.
+
+    Attributes:
+        num_dropped: images that came and were not taken.
+        reason: why no more will come; None while they may.
+    """
+
+    def __init__(self) -> None:
+        self._changed, self._shot = threading.Condition(), None
+        self.num_dropped, self.reason = 0, None
+
+    def put(self, shot: Shot) -> bool:
+        """Offer an image; returns False if no more are wanted."""
+        with self._changed:
+            if self.reason is not None:
+                return False
+            self.num_dropped += self._shot is not None
+            self._shot = replace(shot, arrived=time.monotonic())
+            self._changed.notify_all()
+            return True
+
+    def take(self, timeout_s: float) -> Shot | None:
+        """Wait for an image and take it; None after the last one, or if none comes in time."""
+        with self._changed:
+            self._changed.wait_for(lambda: self._shot is not None or self.reason is not None, timeout_s)
+            shot, self._shot = self._shot, None
+            return shot
+
+    def end(self, reason: str) -> None:
+        """Let no more images come; the first reason stays."""
+        with self._changed:
+            self.reason = reason if self.reason is None else self.reason
+            self._changed.notify_all()
+
+
+_running: "weakref.WeakSet[Newest]" = weakref.WeakSet()  # cameras of this process
+
+
+def end_all() -> bool:
+    """Let the cameras of this process give no more images; returns False if none is running."""
+    running = [newest for newest in _running if newest.reason is None]
+    for newest in running:
+        newest.end("ended by the user")
+    return bool(running)
+
+
+def start(source: str, into: Newest) -> None:
+    """Open a source and offer its images to `into`, from a thread; ValueError if it cannot be opened."""
+    shots = open_source(source)
+    _running.add(into)
+    threading.Thread(target=_offer, args=(shots, source, into), name=f"camera {source}", daemon=True).start()
+
+
+def _offer(shots: Iterator[Shot], source: str, into: Newest) -> None:
+    try:
+        for shot in shots:
+            if not into.put(shot):
+                return
+        into.end(f"{source} has ended")
+    except (OSError, ValueError, cv2.error) as error:
+        into.end(f"{source} has failed: {error}")
+    finally:
+        shots.close()
+
+
+def open_source(source: str) -> Iterator[Shot]:
+    """Open a camera by its number or device, the address of a stream, a video or a recorded folder."""
+    path = Path(source).expanduser()
+    if path.is_dir():
+        return _paced(_recorded(path))
+    if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
+        return _paced(_of_video(Video(path)))
+    if "://" in source:
+        os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", RTSP_OPTIONS)
+    capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+    if not capture.isOpened():
+        devices = ", ".join(str(device) for device in sorted(Path("/dev").glob("video*"))) or "none"
+        raise ValueError(
+            f"camera {source} cannot be opened: it is not there, or another program holds it (devices: {devices}; "
+            "camera:1 is the second, camera:rtsp://… a stream, camera:FILE a video played in real time)"
+        )
+    capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
+    return _of_device(capture)
+
+
+def _of_device(capture: cv2.VideoCapture) -> Iterator[Shot]:
+    try:
+        while True:
+            is_read, image = capture.read()
+            if not is_read:
+                return
+            yield Shot(time.time(), cv2.cvtColor(image, cv2.COLOR_BGR2RGB))
+    finally:
+        capture.release()
+
+
+def _of_video(video: Video) -> Iterator[tuple[float, Callable[[], Shot]]]:
+    for row, seconds in enumerate(video.times):
+        yield seconds, lambda row=row, seconds=seconds: Shot(seconds, video.read(row))
+
+
+def _recorded(folder: Path) -> Iterator[tuple[float, Callable[[], Shot]]]:
+    """The images of a folder with what is beside them, by the times in their names."""
+    for path, seconds in zip(*listed(folder)[:2], strict=True):
+
+        def read(path: Path = path, seconds: float = seconds) -> Shot:
+            image, beside = read_shown(path, None, None), path.with_suffix(".npz")
+            given = None
+            if beside.is_file():
+                with beside.open("rb") as handle:
+                    given = read_npz(handle, (), GIVEN, may_be_compressed=True)
+            return Shot(seconds, image, given)
+
+        yield seconds, read
+
+
+def _paced(shots: Iterator[tuple[float, Callable[[], Shot]]]) -> Iterator[Shot]:
+    """Yield images at the pace of their times."""
+    first, begin = None, time.monotonic()
+    for seconds, read in shots:
+        shot = read()
+        first = seconds if first is None else first
+        time.sleep(max(begin + seconds - first - time.monotonic(), 0.0))
+        yield shot

@@ -1,0 +1,250 @@
+"""Frames of a camera: sources that a test controls, against what they gave."""
+
+import threading
+import time
+
+import cv2
+import numpy as np
+import pytest
+
+from emgs_jax.data import camera, capture
+from emgs_jax.data.base import wait_for_all
+from emgs_jax.data.camera import Camera
+from emgs_jax.data.camera_models import Calibration
+from emgs_jax.data.capture import Newest, Shot, end_all
+from emgs_jax.data.images import Images
+from emgs_jax.data.readable import ReadableFrames
+
+INTRINSICS = (40.0, 40.0, 15.5, 11.5)
+
+
+def an_image(shade: int, size=(32, 24)) -> np.ndarray:
+    return np.full((size[1], size[0], 3), shade, np.uint8)
+
+
+class Source:
+    """A source that gives an image when it is told to."""
+
+    def __init__(self, monkeypatch) -> None:
+        self._given, self._next = [], threading.Semaphore(0)
+        monkeypatch.setattr(capture, "open_source", lambda source: self._shots())
+
+    def give(self, *shots: Shot | None | Exception) -> None:
+        for shot in shots:
+            self._given.append(shot)
+            self._next.release()
+
+    def _shots(self):
+        while True:
+            self._next.acquire()
+            shot = self._given.pop(0)
+            if shot is None:
+                return
+            if isinstance(shot, Exception):
+                raise shot
+            yield shot
+
+
+@pytest.fixture
+def source(monkeypatch):
+    found = Source(monkeypatch)
+    yield found
+    end_all()
+    found.give(Shot(1e9, an_image(0)))  # its thread sees that no more are wanted
+
+
+def until(is_true) -> None:
+    for _ in range(500):
+        if is_true():
+            return
+        time.sleep(0.01)
+    raise AssertionError("it does not happen")
+
+
+def test_the_newest_image_is_taken_and_those_that_it_replaced_are_counted():
+    newest = Newest()
+    for number in range(5):
+        assert newest.put(Shot(float(number), an_image(number)))
+    assert newest.take(1.0).time == 4.0 and newest.num_dropped == 4
+    begin = time.monotonic()
+    assert newest.take(0.05) is None and 0.04 < time.monotonic() - begin < 5.0
+    newest.put(Shot(5.0, an_image(5)))
+    newest.end("enough"), newest.end("later")
+    assert newest.take(1.0).time == 5.0, "the last one is not lost"
+    assert newest.take(1.0) is None and newest.reason == "enough" and newest.num_dropped == 4
+    assert not newest.put(Shot(6.0, an_image(6)))
+
+
+def test_frames_come_one_by_one_and_their_number_is_not_known_before_the_end(source):
+    source.give(Shot(10.0, an_image(1)))
+    frames = ReadableFrames(Camera(source="0", intrinsics=INTRINSICS, size=(32, 24)))
+    assert len(frames) == 1 and frames.total is None and frames.intrinsics == INTRINSICS
+    threading.Timer(0.2, source.give, [Shot(10.5, an_image(2))]).start()
+    begin = time.monotonic()
+    assert frames.has(1) and time.monotonic() - begin > 0.1, "it waits for the image"
+    assert [frames[row].timestamp for row in (0, 1)] == [10.0, 10.5]
+    assert [int(frames[row].image[0, 0, 0]) for row in (0, 1)] == [1, 2]
+    source.give(None)
+    assert not frames.has(2) and frames.total == len(frames) == 2 and frames.kept == [0, 1]
+    assert not frames.has(2)
+
+
+def test_images_that_come_while_none_is_asked_for_are_dropped_but_for_the_newest(source):
+    source.give(Shot(0.0, an_image(0)))
+    frames = Camera(source="0", intrinsics=INTRINSICS, size=(32, 24))
+    source.give(*(Shot(0.1 * number, an_image(number)) for number in range(1, 7)))
+    until(lambda: frames._newest.num_dropped == 5)
+    assert frames.has(1) and int(frames[1].image[0, 0, 0]) == 6
+    words = [frames.progress_words(index) for index in (0, 1)]
+    assert "5 dropped" in words[1] and " s behind" in words[1]
+    assert frames.report()["camera/num_dropped"] == 5 and 0 <= frames.report()["camera/median_latency_s"] < 60
+
+
+def test_mapping_begins_with_the_newest_image(source):
+    source.give(Shot(0.0, an_image(0)))
+    frames = ReadableFrames(Camera(source="0", intrinsics=INTRINSICS, size=(32, 24)), "skip")
+    source.give(Shot(1.0, an_image(7)))
+    until(lambda: frames._dataset._newest._shot is not None)
+    frames.begin()
+    assert len(frames) == 1 and int(frames[0].image[0, 0, 0]) == 7 and frames.report()["camera/num_dropped"] == 0
+    assert len([*frames.files(0)[0].parent.iterdir()]) == 1
+
+
+@pytest.mark.parametrize(
+    ("last", "words"),
+    [
+        (None, "7 has ended"),
+        (OSError("unplugged"), "7 has failed: unplugged"),
+        (Shot(2.0, an_image(2, (64, 48))), "camera 7 gave images of 32x24, and now images of 64x48"),
+    ],
+)
+def test_a_camera_that_ends_fails_or_changes_its_size_gives_no_more_frames_and_says_why(source, last, words):
+    source.give(Shot(0.0, an_image(0)))
+    frames = Camera(source="7", intrinsics=INTRINSICS)
+    source.give(last)
+    assert not frames.has(1) and frames._newest.reason == words and frames.total == 1
+    assert frames[0].image is not None
+
+
+def test_a_camera_that_stalls_gives_no_more_frames(source, monkeypatch):
+    monkeypatch.setattr(camera, "NEXT_S", 0.1)
+    source.give(Shot(0.0, an_image(0)))
+    frames = Camera(source="7", intrinsics=INTRINSICS)
+    assert not frames.has(1) and frames._newest.reason == "camera 7 has given no image for 0.1 s"
+
+
+@pytest.mark.parametrize(("given", "words"), [((), "camera 7 gives no image in 0.1 s"), ((None,), "7 has ended")])
+def test_a_camera_without_an_image_is_an_error(source, monkeypatch, given, words):
+    monkeypatch.setattr(camera, "FIRST_S", 0.1)
+    source.give(*given)
+    with pytest.raises(ValueError, match=words):
+        Camera(source="7", intrinsics=INTRINSICS)
+
+
+def test_a_camera_that_is_not_there_names_those_that_are():
+    with pytest.raises(ValueError, match=r"camera /dev/nothing cannot be opened: .* \(devices: "):
+        Camera(source="/dev/nothing", intrinsics=INTRINSICS)
+
+
+@pytest.mark.parametrize("given", [None, "exif"])
+def test_intrinsics_that_a_camera_cannot_tell_are_asked_for_before_it_is_opened(given):
+    with pytest.raises(ValueError, match=r"dataset.intrinsics is not set: give \[fx,fy,cx,cy\]"):
+        Camera(source="/dev/nothing", intrinsics=given)
+
+
+@pytest.mark.parametrize("most", [{"max_frames": 1}, {"max_seconds": 0.0}])
+def test_it_ends_after_so_many_images_or_seconds(source, most):
+    source.give(*(Shot(float(number), an_image(number)) for number in range(2)))
+    frames = Camera(source="0", intrinsics=INTRINSICS, **most)
+    assert not frames.has(1) and frames._newest.reason == "that is as many as asked for" and frames.total == 1
+    assert not end_all(), "none is running"
+
+
+def test_all_cameras_of_the_process_can_be_ended(source):
+    source.give(Shot(0.0, an_image(0)))
+    frames = Camera(source="0", intrinsics=INTRINSICS)
+    threading.Timer(0.1, end_all).start()
+    assert not frames.has(1) and frames._newest.reason == "ended by the user"
+
+
+def test_no_more_images_a_second_are_taken_than_asked_for(source):
+    source.give(Shot(0.0, an_image(0)))
+    frames = Camera(source="0", intrinsics=INTRINSICS, fps=5.0)
+    threading.Thread(
+        target=lambda: [(time.sleep(0.02), source.give(Shot(0.1 * n, an_image(n)))) for n in range(1, 60)], daemon=True
+    ).start()
+    assert frames.has(4)
+    assert (np.diff(frames._arrived) >= 0.2).all()
+
+
+def test_to_estimate_intrinsics_all_images_are_taken_first(source):
+    seen = []
+
+    def estimate(pictures):
+        seen.append([int(pictures.read(row)[0, 0, 0]) for row in range(pictures.count)])
+        return Calibration(INTRINSICS), {"source": "estimate"}
+
+    source.give(Shot(0.0, an_image(0)))
+    threading.Timer(0.1, lambda: [source.give(Shot(1.0, an_image(1))), time.sleep(0.3), source.give(None)]).start()
+    frames = Camera(source="0", intrinsics=estimate, size=(32, 24))
+    assert seen == [[0, 1]] and frames.total == 2 == wait_for_all(frames) and frames.intrinsics == INTRINSICS
+
+
+def test_a_recording_is_read_again_as_the_same_frames_with_what_came_beside_them(source, tmp_path):
+    given = {"depth": np.full((24, 32), 1.5, np.float32), "T_world_camera": np.eye(4)}
+    lens = (*INTRINSICS, -0.2, 0.05, 0.0, 0.0)
+    source.give(Shot(1764.0, an_image(3), given))
+    frames = Camera(source="0", intrinsics=lens, record=True, folder=tmp_path)
+    source.give(Shot(1764.25, an_image(4), given), None)
+    assert wait_for_all(frames) == 2
+    settings = frames.recording()
+    assert settings.pop("_target_") == "emgs_jax.data.images.Images" and settings["root"] == str(tmp_path / "recorded")
+    again = Images(**settings)
+    assert len(again) == 2 and again.fingerprint() == frames.fingerprint() and again.intrinsics == frames.intrinsics
+    for row in range(2):
+        assert again[row].timestamp == frames[row].timestamp and again[row].name == frames[row].name
+        np.testing.assert_array_equal(again[row].image, frames[row].image)
+    beside = np.load(again.files(0)[0].with_suffix(".npz"))
+    # Depth is straightened with the image to which it is registered: beyond its border there is none.
+    assert (beside["depth"] == 0).any() and beside["depth"][12, 16] == 1.5
+    with pytest.raises(ValueError, match="holds an earlier recording"):
+        Camera(source="0", intrinsics=lens, record=True, folder=tmp_path)
+
+
+def test_a_clock_that_is_set_back_keeps_the_order(source):
+    source.give(Shot(10.0, an_image(0)))
+    frames = Camera(source="0", intrinsics=INTRINSICS)
+    source.give(Shot(9.0, an_image(1)), None)
+    assert wait_for_all(frames) == 2 and frames[1].timestamp > frames[0].timestamp
+
+
+def test_images_that_are_not_recorded_are_deleted(source):
+    source.give(Shot(0.0, an_image(0)))
+    frames = Camera(source="0", intrinsics=INTRINSICS)
+    folder = frames.files(0)[0].parent
+    assert folder.is_dir() and frames.recording() is None
+    end_all()
+    del frames
+    until(lambda: not folder.exists())
+
+
+def test_a_recorded_folder_and_a_video_are_played_at_the_pace_of_their_times(tmp_path):
+    for number in range(4):
+        cv2.imwrite(str(tmp_path / f"{5 + 0.1 * number:.6f}.png"), an_image(number))
+    np.savez(tmp_path / "5.100000.npz", depth=np.ones((2, 2), np.float32), other=np.zeros(1))
+    begin, shots = time.monotonic(), []
+    for shot in capture.open_source(str(tmp_path)):
+        shots.append((time.monotonic() - begin, shot))
+    late = [at - (shot.time - 5.0) for at, shot in shots]
+    assert [int(shot.image[0, 0, 0]) for _, shot in shots] == [0, 1, 2, 3] and min(late) >= 0 and max(late) < 0.2
+    assert shots[0][1].given is None and [*shots[1][1].given] == ["depth"]
+
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 10.0, (32, 24))
+    for number in range(3):
+        writer.write(an_image(80 * number))
+    writer.release()
+    begin, times = time.monotonic(), []
+    for shot in capture.open_source(str(path)):
+        times.append((time.monotonic() - begin, shot.time))
+    assert [round(found, 3) for _, found in times] == [0.0, 0.1, 0.2] and times[-1][0] >= 0.2
