@@ -13,6 +13,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from tqdm import tqdm
 
 from emgs_jax.data.base import wait_for_all
 from emgs_jax.data.capture import Newest, Shot, start
@@ -47,7 +48,8 @@ class Camera(Straightened):
     name = "camera"
 
     def __post_init__(self) -> None:
-        self._newest, self._images, self._times, self._arrived, self._mapped = Newest(), [], [], [], []
+        self._newest, self._is_over = Newest(), False
+        self._images, self._times, self._arrived, self._mapped = [], [], [], []
         self.sequence, self._given = str(self.source), self.intrinsics  # `_use` replaces the latter
         if self._given in (None, "exif"):
             raise ValueError(
@@ -104,23 +106,34 @@ class Camera(Straightened):
 
     def has(self, index: int) -> bool:
         while len(self) <= index:
-            is_full = self.max_frames is not None and len(self) >= self.max_frames
-            is_late = self.max_seconds is not None and time.monotonic() - self._begin > self.max_seconds
-            if is_full or is_late:
-                self._newest.end("that is as many as asked for")
-                return False
-            shot = self._newest.take(NEXT_S)
-            if shot is not None and self.fps and shot.arrived - self._arrived[-1] < 1 / self.fps:
-                continue
-            if shot is not None and shot.image.shape[1::-1] != self._raw_size:
-                was, now = as_words(self._raw_size), as_words(shot.image.shape[1::-1])
-                self._newest.end(f"camera {self.source} gave {was}, and now {now}")
-                shot = None
+            shot = self._next()
             if shot is None:
-                self._newest.end(f"camera {self.source} has given no image for {NEXT_S:g} s")
+                if not self._is_over:
+                    tqdm.write(f"no more images: {self._newest.reason}")
+                self._is_over = True
                 return False
             self._add(shot)
         return True
+
+    def _next(self) -> Shot | None:
+        """Wait for the next image in use; None after the last one, for the reason that `_newest` has."""
+        while True:
+            if self.max_frames is not None and len(self) >= self.max_frames:
+                self._newest.end(f"dataset.max_frames={self.max_frames} are taken")
+                return None
+            if self.max_seconds is not None and time.monotonic() - self._begin > self.max_seconds:
+                self._newest.end(f"dataset.max_seconds={self.max_seconds:g} have passed")
+                return None
+            shot = self._newest.take(NEXT_S)
+            if shot is None:
+                self._newest.end(f"camera {self.source} has given none for {NEXT_S:g} s")
+                return None
+            if shot.image.shape[1::-1] != self._raw_size:
+                was, now = as_words(self._raw_size), as_words(shot.image.shape[1::-1])
+                self._newest.end(f"camera {self.source} gave {was}, and now {now}")
+                return None
+            if not self.fps or shot.arrived - self._arrived[-1] >= 1 / self.fps:
+                return shot
 
     def begin(self) -> None:
         """Begin with the newest image: the first one came before the programs were compiled."""

@@ -101,9 +101,9 @@ def _offer(shots: Iterator[Shot], source: str, into: Newest) -> None:
         for shot in shots:
             if not into.put(shot):
                 return
-        into.end(f"{source} has ended")
+        into.end(f"camera {source} has ended")
     except (OSError, ValueError, cv2.error) as error:
-        into.end(f"{source} has failed: {error}")
+        into.end(f"camera {source} has failed: {error}")
     finally:
         shots.close()
 

@@ -113,8 +113,8 @@ def test_mapping_begins_with_the_newest_image(source):
 @pytest.mark.parametrize(
     ("last", "words"),
     [
-        (None, "7 has ended"),
-        (OSError("unplugged"), "7 has failed: unplugged"),
+        (None, "camera 7 has ended"),
+        (OSError("unplugged"), "camera 7 has failed: unplugged"),
         (Shot(2.0, an_image(2, (64, 48))), "camera 7 gave images of 32x24, and now images of 64x48"),
     ],
 )
@@ -130,10 +130,10 @@ def test_a_camera_that_stalls_gives_no_more_frames(source, monkeypatch):
     monkeypatch.setattr(camera, "NEXT_S", 0.1)
     source.give(Shot(0.0, an_image(0)))
     frames = Camera(source="7", intrinsics=INTRINSICS)
-    assert not frames.has(1) and frames._newest.reason == "camera 7 has given no image for 0.1 s"
+    assert not frames.has(1) and frames._newest.reason == "camera 7 has given none for 0.1 s"
 
 
-@pytest.mark.parametrize(("given", "words"), [((), "camera 7 gives no image in 0.1 s"), ((None,), "7 has ended")])
+@pytest.mark.parametrize(("given", "words"), [((), "camera 7 gives no image in 0.1 s"), ((None,), "camera 7 has ended")])
 def test_a_camera_without_an_image_is_an_error(source, monkeypatch, given, words):
     monkeypatch.setattr(camera, "FIRST_S", 0.1)
     source.give(*given)
@@ -152,12 +152,15 @@ def test_intrinsics_that_a_camera_cannot_tell_are_asked_for_before_it_is_opened(
         Camera(source="/dev/nothing", intrinsics=given)
 
 
-@pytest.mark.parametrize("most", [{"max_frames": 1}, {"max_seconds": 0.0}])
-def test_it_ends_after_so_many_images_or_seconds(source, most):
+@pytest.mark.parametrize(
+    ("most", "words"),
+    [({"max_frames": 1}, "dataset.max_frames=1 are taken"), ({"max_seconds": 0.0}, "dataset.max_seconds=0 have passed")],
+)
+def test_it_ends_after_so_many_images_or_seconds_and_says_so_once(source, most, words, capsys):
     source.give(*(Shot(float(number), an_image(number)) for number in range(2)))
     frames = Camera(source="0", intrinsics=INTRINSICS, **most)
-    assert not frames.has(1) and frames._newest.reason == "that is as many as asked for" and frames.total == 1
-    assert not end_all(), "none is running"
+    assert not frames.has(1) and not frames.has(1) and frames.total == 1
+    assert capsys.readouterr().out == f"no more images: {words}\n" and not end_all(), "none is running"
 
 
 def test_all_cameras_of_the_process_can_be_ended(source):
@@ -191,8 +194,8 @@ def test_to_estimate_intrinsics_all_images_are_taken_first(source):
 
 
 def test_a_recording_is_read_again_as_the_same_frames_with_what_came_beside_them(source, tmp_path):
-    given = {"depth": np.full((24, 32), 1.5, np.float32), "T_world_camera": np.eye(4)}
-    lens = (*INTRINSICS, -0.2, 0.05, 0.0, 0.0)
+    given = {"depth": np.linspace(1, 2, 24 * 32, dtype=np.float32).reshape(24, 32), "T_world_camera": np.eye(4)}
+    lens = (20.0, 20.0, 15.5, 11.5, -0.2, 0.05, 0.0, 0.0)
     source.give(Shot(1764.0, an_image(3), given))
     frames = Camera(source="0", intrinsics=lens, record=True, folder=tmp_path)
     source.give(Shot(1764.25, an_image(4), given), None)
@@ -204,9 +207,9 @@ def test_a_recording_is_read_again_as_the_same_frames_with_what_came_beside_them
     for row in range(2):
         assert again[row].timestamp == frames[row].timestamp and again[row].name == frames[row].name
         np.testing.assert_array_equal(again[row].image, frames[row].image)
-    beside = np.load(again.files(0)[0].with_suffix(".npz"))
-    # Depth is straightened with the image to which it is registered: beyond its border there is none.
-    assert (beside["depth"] == 0).any() and beside["depth"][12, 16] == 1.5
+    beside = np.load(again.files(0)[0].with_suffix(".npz"))["depth"]
+    assert (beside != given["depth"]).any(), "depth is straightened with the image to which it is registered"
+    np.testing.assert_array_equal(beside, again._lens.straighten_depth(given["depth"]))
     with pytest.raises(ValueError, match="holds an earlier recording"):
         Camera(source="0", intrinsics=lens, record=True, folder=tmp_path)
 
