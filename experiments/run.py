@@ -14,12 +14,12 @@ from tqdm import tqdm
 from emgs_jax.back_end.saved_map import load_saved_map
 from emgs_jax.config.configure import baseline_configs, build, build_dataset, build_prior, graph_config
 from emgs_jax.config.values import check_values
-from emgs_jax.data.capture import end_all
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog, owned
 from emgs_jax.io.packages import extra
+from emgs_jax.live.capture import end_all
 from emgs_jax.mapping.capacity import prepared_beside
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.mapping.convert import to_camera

@@ -22,7 +22,19 @@ CORE_ROOMS = (
 # What is solved between frames, by SciPy; the core does not import it.
 HOST_FILES = {"pose_graph.sparse", "pose_graph.chordal", "pose_graph.problem", "pose_graph.optimize"}
 HOST = (
-    *("geometry", "data", "io", "features", "keypoints", "loop_closure", "structure", "prior", "evaluation", "device"),
+    *(
+        "geometry",
+        "data",
+        "io",
+        "live",
+        "features",
+        "keypoints",
+        "loop_closure",
+        "structure",
+        "prior",
+        "evaluation",
+        "device",
+    ),
     *("back_end", "mapping", "config", "sequence", "polish", "drawing", "runs", "report", "viewer"),
 )
 STAGES = {

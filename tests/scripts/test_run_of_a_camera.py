@@ -13,9 +13,9 @@ from tiny_run import TINY, dataset
 
 import experiments.run
 from emgs_jax.config import configure
-from emgs_jax.data import capture
-from emgs_jax.data.capture import Shot
 from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.live import capture
+from emgs_jax.live.capture import Shot
 
 pytestmark = pytest.mark.xdist_group("tiny")
 
@@ -47,7 +47,7 @@ def camera(monkeypatch):
             yield shot
 
     begin = capture.start
-    monkeypatch.setattr("emgs_jax.data.camera.start", start)
+    monkeypatch.setattr("emgs_jax.live.camera.start", start)
     monkeypatch.setattr(capture, "open_source", one_by_one)
 
 

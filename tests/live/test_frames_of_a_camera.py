@@ -7,13 +7,13 @@ import cv2
 import numpy as np
 import pytest
 
-from emgs_jax.data import camera, capture
 from emgs_jax.data.base import wait_for_all
-from emgs_jax.data.camera import Camera
 from emgs_jax.data.camera_models import Calibration
-from emgs_jax.data.capture import Newest, Shot, end_all
 from emgs_jax.data.images import Images
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.live import camera, capture
+from emgs_jax.live.camera import Camera
+from emgs_jax.live.capture import Newest, Shot, end_all
 
 INTRINSICS = (40.0, 40.0, 15.5, 11.5)
 
@@ -133,11 +133,11 @@ def test_a_camera_that_stalls_gives_no_more_frames(source, monkeypatch):
     assert not frames.has(1) and frames._newest.reason == "camera 7 has given none for 0.1 s"
 
 
-@pytest.mark.parametrize(("given", "words"), [((), "camera 7 gives no image in 0.1 s"), ((None,), "camera 7 has ended")])
+@pytest.mark.parametrize(("given", "words"), [((), "gives no image in 0.1 s"), ((None,), "has ended")])
 def test_a_camera_without_an_image_is_an_error(source, monkeypatch, given, words):
     monkeypatch.setattr(camera, "FIRST_S", 0.1)
     source.give(*given)
-    with pytest.raises(ValueError, match=words):
+    with pytest.raises(ValueError, match=f"camera 7 {words}"):
         Camera(source="7", intrinsics=INTRINSICS)
 
 
@@ -154,13 +154,16 @@ def test_intrinsics_that_a_camera_cannot_tell_are_asked_for_before_it_is_opened(
 
 @pytest.mark.parametrize(
     ("most", "words"),
-    [({"max_frames": 1}, "dataset.max_frames=1 are taken"), ({"max_seconds": 0.0}, "dataset.max_seconds=0 have passed")],
+    [
+        ({"max_frames": 1}, "max_frames=1 are taken"),
+        ({"max_seconds": 0.0}, "max_seconds=0 have passed"),
+    ],
 )
 def test_it_ends_after_so_many_images_or_seconds_and_says_so_once(source, most, words, capsys):
     source.give(*(Shot(float(number), an_image(number)) for number in range(2)))
     frames = Camera(source="0", intrinsics=INTRINSICS, **most)
     assert not frames.has(1) and not frames.has(1) and frames.total == 1
-    assert capsys.readouterr().out == f"no more images: {words}\n" and not end_all(), "none is running"
+    assert capsys.readouterr().out == f"no more images: dataset.{words}\n" and not end_all(), "none is running"
 
 
 def test_all_cameras_of_the_process_can_be_ended(source):

@@ -16,12 +16,12 @@ import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.data.base import wait_for_all
-from emgs_jax.data.capture import Newest, Shot, start
 from emgs_jax.data.images import Images
 from emgs_jax.data.intrinsics import Given, Pictures, find_lens
 from emgs_jax.data.reading import Size, about_pixels
 from emgs_jax.data.straightened import Straightened
 from emgs_jax.io.files import atomic_write
+from emgs_jax.live.capture import Newest, Shot, start
 
 RECORDED = "recorded"  # folder of a run
 FIRST_S, NEXT_S = 30.0, 10.0  # longest wait for the first image, and for each other one
@@ -186,4 +186,5 @@ class Camera(Straightened):
 
 
 def as_words(size: Size) -> str:
+    """Name images by their (width, height)."""
     return f"images of {size[0]}x{size[1]}"
