@@ -49,6 +49,7 @@ from emgs_jax.runs.metrics import (
 from emgs_jax.runs.polished import OPTAX, polish
 from emgs_jax.runs.provenance import is_metric, provenance, signature, write_metrics
 from emgs_jax.viewer.live import LiveView, live_view
+from emgs_jax.viewer.ros import RosConfig, RosView, ros_view
 
 from .command import command
 from .interrupt import cameras_first
@@ -88,7 +89,10 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             fitting = build(config, "polish") if config.polish else None
             if fitting is not None:
                 extra(*OPTAX)
-            live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
+            if isinstance(watched, RosConfig):
+                live = stack.enter_context(ros_view(watched, folder))
+            else:
+                live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
             baselines = Baselines(fused, slam.observation, dataset)
             settings = OmegaConf.to_container(config, resolve=True)
             origin = provenance(settings, dataset, prior.provenance)
@@ -136,7 +140,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             notes = [*notes, *polish_lines(polish(finished, dataset, fitting, densify))]
     with _said(clock, "report", f"writing {REPORT_FILE}"):
         write_report(finished, dataset)
-    if live is not None:
+    if isinstance(live, LiveView):
         notes = [*notes, f"the live view has ended; emgs view {folder} shows the finished run"]
     notes = [*notes, *revisit_note(session.back_end)]
     counts, took = frame_lines(session.records, len(dataset.skipped)), time_words(clock, len(session.records))
@@ -161,7 +165,7 @@ def _map(
     compared: tuple[Baselines, EvaluationConfig, bool],
     folder: Path,
     keeper: Keeper,
-    live: LiveView | None,
+    live: LiveView | RosView | None,
 ) -> tuple[MappingRun, RawPrior]:
     """Map all frames and log each; return the run and the raw predictions. An interrupted run writes what it has."""
     if keeper.found is not None:

@@ -194,15 +194,19 @@ def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Ca
     wanted = beside if info_topic is None and beside in kinds else info_topic
     chosen = _connections(bag, _topic_of(bag, (INFO,), wanted, path, "info_topic"))
     for connection, _, raw in bag.messages(connections=chosen):
-        message = bag.deserialize(raw, connection.msgtype)
-        K, bent, P = (getattr(message, name if hasattr(message, name) else name.upper()) for name in "kdp")  # ROS 1: K
-        size, bent = (int(message.width), int(message.height)), [float(v) for v in bent]
-        if RECTIFIED.search(topic):  # K and D are of the raw image, P of the rectified one
-            if not P[0] > 0 or not P[5] > 0:
-                raise ValueError(f"{path}: camera_info has no P for the rectified {topic}: give dataset.intrinsics")
-            return Calibration((float(P[0]), float(P[5]), float(P[2]), float(P[6])), (), size)
-        intrinsics = float(K[0]), float(K[4]), float(K[2]), float(K[5])
-        where = f"{path}: camera_info (a rectified topic needs none of its distortion)"
-        lens, model = named_lens(message.distortion_model, bent, where)
-        return Calibration(intrinsics, lens, size, model)
+        return calibration_of(bag.deserialize(raw, connection.msgtype), topic, str(path))
     raise ValueError(f"{path}: camera_info has no message, so dataset.intrinsics must say the camera: {ALTERNATIVES}")
+
+
+def calibration_of(message: Any, topic: str, where: str) -> Calibration:
+    """The camera of a CameraInfo for the images of `topic`; ValueError if it is not whole."""
+    K, bent, P = (getattr(message, name if hasattr(message, name) else name.upper()) for name in "kdp")  # ROS 1: K
+    size, bent = (int(message.width), int(message.height)), [float(v) for v in bent]
+    if RECTIFIED.search(topic):  # K and D are of the raw image, P of the rectified one
+        if not P[0] > 0 or not P[5] > 0:
+            raise ValueError(f"{where}: camera_info has no P for the rectified {topic}: give dataset.intrinsics")
+        return Calibration((float(P[0]), float(P[5]), float(P[2]), float(P[6])), (), size)
+    intrinsics = float(K[0]), float(K[4]), float(K[2]), float(K[5])
+    about = f"{where}: camera_info (a rectified topic needs none of its distortion)"
+    lens, model = named_lens(message.distortion_model, bent, about)
+    return Calibration(intrinsics, lens, size, model)

@@ -16,6 +16,7 @@ import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.data.base import wait_for_all
+from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.images import Images
 from emgs_jax.data.intrinsics import Given, Pictures, find_lens
 from emgs_jax.data.reading import Size, about_pixels
@@ -27,6 +28,11 @@ RECORDED = "recorded"  # folder of a run
 FIRST_S, NEXT_S = 30.0, 10.0  # longest wait for the first image, and for each other one
 NUM_TIMED = 20  # frames of which the bar tells the rate
 FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
+NO_INTRINSICS = (
+    "dataset.intrinsics is not set: give [fx,fy,cx,cy] in pixels of the camera's images, or a calibration file. "
+    "dataset.intrinsics=estimate finds them once all images are taken (emgs run camera); its metrics.json has them "
+    "then (provenance, data, camera)"
+)
 
 
 @dataclass(eq=False)
@@ -51,14 +57,13 @@ class Camera(Straightened):
         self._newest, self._is_over = Newest(), False
         self._images, self._times, self._arrived, self._mapped = [], [], [], []
         self.sequence, self._given = str(self.source), self.intrinsics  # `_use` replaces the latter
-        if self._given in (None, "exif"):
-            raise ValueError(
-                "dataset.intrinsics is not set: give [fx,fy,cx,cy] in pixels of the camera's images, or a calibration "
-                "file. dataset.intrinsics=estimate finds them once all images are taken (emgs run camera); its "
-                "metrics.json has them then (provenance, data, camera)"
-            )
+        if self._given in (None, "exif") and not self.sequence.startswith("ros"):
+            raise ValueError(NO_INTRINSICS)
         self._folder = self._new_folder()
-        start(self.sequence, self._newest)
+        told = start(self.sequence, self._newest)
+        self._given = numbers_of(told) if self._given is None and told is not None else self._given
+        if self._given is None:
+            raise ValueError(NO_INTRINSICS)
         shot = self._newest.take(FIRST_S)
         if shot is None:
             raise ValueError(self._newest.reason or f"camera {self.source} gives no image in {FIRST_S:g} s")
@@ -188,3 +193,10 @@ class Camera(Straightened):
 def as_words(size: Size) -> str:
     """Name images by their (width, height)."""
     return f"images of {size[0]}x{size[1]}"
+
+
+def numbers_of(camera: Calibration) -> list[float]:
+    """Write a camera as `dataset.intrinsics`; ValueError for a lens that needs a calibration file."""
+    if camera.model != "OPENCV":
+        raise ValueError(f"the lens is {camera.model}: take the rectified topic, or give dataset.intrinsics")
+    return [*camera.intrinsics, *camera.distortion]

@@ -14,6 +14,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.images import listed
 from emgs_jax.data.tones import read_shown
 from emgs_jax.data.video import VIDEO_SUFFIXES, Video
@@ -89,11 +90,20 @@ def end_all() -> bool:
     return bool(running)
 
 
-def start(source: str, into: Newest) -> None:
-    """Open a source and offer its images to `into`, from a thread; ValueError if it cannot be opened."""
+def start(source: str, into: Newest) -> Calibration | None:
+    """Open a source and offer its images to `into`, from a thread; ValueError if it cannot be opened.
+
+    Returns the camera if the source tells it.
+    """
+    if source.split()[0] == "ros":
+        from emgs_jax.live.ros import subscribe  # an extra
+
+        _running.add(into)
+        return subscribe(source.split()[1:], into)
     shots = open_source(source)
     _running.add(into)
     threading.Thread(target=_offer, args=(shots, source, into), name=f"camera {source}", daemon=True).start()
+    return None
 
 
 def _offer(shots: Iterator[Shot], source: str, into: Newest) -> None:

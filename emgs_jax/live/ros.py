@@ -1,0 +1,148 @@
+"""Images of ROS 2 topics, with their depth and the odometry of the camera, as a source of `Camera`.
+
+`rclpy` is the robot's own where there is one, else that of the extra `ros`. Topics are named `image`, `camera_info`,
+`depth` and `odometry`, and remapped as in ROS: `image:=/camera/color/image_raw`.
+"""
+
+import contextlib
+import threading
+from collections.abc import Sequence
+from functools import partial
+from types import ModuleType
+from typing import Any
+
+import cv2
+import numpy as np
+
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.camera_models import Calibration
+from emgs_jax.data.reading import rigid
+from emgs_jax.data.rosbag import calibration_of, to_rgb
+from emgs_jax.data.tones import ALL_16_BITS
+from emgs_jax.io.packages import extra
+from emgs_jax.live.capture import Newest, Shot
+from emgs_jax.live.joined_messages import Joined
+
+INFO_S = 30.0  # longest wait for the camera_info
+TOPICS = ("image", "camera_info", "depth", "odometry")
+PUBLISHED = ("map", "map_update", "path", "pose", "diagnostics", "save")  # by `viewer.ros`
+BAYER = {"bayer_rggb8": cv2.COLOR_BayerBG2RGB, "bayer_bggr8": cv2.COLOR_BayerRG2RGB}
+BAYER |= {"bayer_gbrg8": cv2.COLOR_BayerGR2RGB, "bayer_grbg8": cv2.COLOR_BayerGB2RGB}
+MILLIMETRE = 1e-3
+
+
+def started(words: Sequence[str]) -> ModuleType:
+    """Return rclpy, initialised once in this process with `words` like `image:=/camera/image_raw`.
+
+    Raises:
+        ValueError: it is not installed, or a word is no remapping.
+    """
+    rclpy = extra("rclpy", "ROS 2 needs rclpy, the robot's own (source its setup.bash) or", "ros")
+    for word in words:
+        name, is_remapping, topic = word.partition(":=")
+        if not is_remapping or name not in (*TOPICS, *PUBLISHED) or not topic:
+            known = ", ".join((*TOPICS, *PUBLISHED))
+            raise ValueError(f"{word} is no remapping NAME:=TOPIC of one of {known}")
+    if not rclpy.ok():
+        from rclpy.signals import SignalHandlerOptions
+
+        remapped = [part for word in words for part in ("-r", word)]
+        arguments = ["emgs", "--ros-args", *remapped] if remapped else ["emgs"]
+        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C is the command's
+    return rclpy
+
+
+def subscribe(words: Sequence[str], into: Newest) -> Calibration | None:
+    """Offer the images of the topics to `into`, from a thread; return their camera.
+
+    Raises:
+        ValueError: no CameraInfo comes.
+    """
+    rclpy = started(words)
+    from rclpy.executors import SingleThreadedExecutor
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import CameraInfo, CompressedImage, Image
+
+    topics = dict(word.split(":=") for word in words)
+    node, told = rclpy.create_node("emgs"), threading.Event()
+    kinds = {kind for kind, name in (("depth", "depth"), ("pose", "odometry")) if name in topics}
+    joined, infos = Joined(kinds), []
+
+    def add(kind: str, message: Any) -> None:
+        try:
+            value = READERS[kind](message)
+        except (BadFrameError, ValueError) as error:
+            into.end(f"ros: {error}")
+            return
+        for time_s, found in joined.add(kind, stamp_of(message), value):
+            given = {name: found[kind] for kind, name in GIVEN.items() if kind in found}
+            into.put(Shot(time_s, found["image"], given or None))
+
+    def learn(message: Any) -> None:
+        infos.append(message)
+        told.set()
+
+    image_type = CompressedImage if topics.get("image", "").endswith("compressed") else Image
+    quality = qos_profile_sensor_data
+    node.create_subscription(image_type, "image", partial(add, "image"), quality)
+    node.create_subscription(CameraInfo, "camera_info", learn, quality)
+    if "depth" in kinds:
+        node.create_subscription(Image, "depth", partial(add, "depth"), quality)
+    if "pose" in kinds:
+        from nav_msgs.msg import Odometry
+
+        node.create_subscription(Odometry, "odometry", partial(add, "pose"), quality)
+    executor = SingleThreadedExecutor()
+    executor.add_node(node)
+    threading.Thread(target=_spin, args=(executor, node, into), name="ros", daemon=True).start()
+    if not told.wait(INFO_S):
+        into.end("ros: no camera_info")
+        topic = node.resolve_topic_name("camera_info")
+        raise ValueError(
+            f"no CameraInfo comes on {topic} in {INFO_S:g} s: remap it (camera_info:=…), or start the camera"
+        )
+    return calibration_of(infos[-1], topics.get("image", "image"), "ROS")
+
+
+def _spin(executor: Any, node: Any, into: Newest) -> None:
+    """Serve the node's callbacks until no more images are wanted."""
+    with contextlib.suppress(Exception):  # ROS is shut down
+        while into.reason is None:
+            executor.spin_once(timeout_sec=0.1)
+        node.destroy_node()
+
+
+def stamp_of(message: Any) -> float:
+    """Seconds of a message's header."""
+    return message.header.stamp.sec + message.header.stamp.nanosec / 1e9
+
+
+def image_of(message: Any) -> np.ndarray:
+    """RGB image, uint8 (h, w, 3), of an Image or a CompressedImage; BadFrameError if it is damaged or unknown."""
+    encoding = getattr(message, "encoding", None)
+    if encoding in BAYER:
+        raw = np.asarray(message.data, np.uint8).reshape(message.height, message.step)[:, : message.width]
+        return cv2.cvtColor(raw, BAYER[encoding])
+    return ALL_16_BITS.shown(to_rgb(message, encoding is None, "the topic image"))
+
+
+def depth_of(message: Any) -> np.ndarray:
+    """Depth in metres, float32 (h, w), 0 = none, of an Image in 16UC1 (millimetres) or 32FC1 (metres)."""
+    kinds = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
+    if message.encoding not in kinds:
+        raise BadFrameError(f"the topic depth has the encoding {message.encoding!r}, and read are {', '.join(kinds)}")
+    dtype = np.dtype(kinds[message.encoding]).newbyteorder(">" if message.is_bigendian else "<")
+    rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)[:, : message.width * dtype.itemsize]
+    raw = np.ascontiguousarray(rows).view(dtype).reshape(message.height, message.width)
+    depth = raw.astype(np.float32) * (MILLIMETRE if dtype.kind == "u" else 1.0)
+    return np.where(np.isfinite(depth) & (depth > 0), depth, 0.0).astype(np.float32)
+
+
+def pose_of(message: Any) -> np.ndarray:
+    """T_odom_camera (4, 4) of an Odometry whose child frame is the camera's optical frame."""
+    place, turn = message.pose.pose.position, message.pose.pose.orientation
+    return rigid((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
+
+
+READERS = {"image": image_of, "depth": depth_of, "pose": pose_of}
+GIVEN = {"depth": "depth", "pose": "T_world_camera"}
