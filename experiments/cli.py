@@ -9,7 +9,7 @@ from .console import speak_on
 from .interrupt import clear_interrupt
 
 GROUPS = {
-    "make a map": ("run", "merge", "predict"),
+    "make a map": ("run", "ros", "merge", "predict"),
     "look at it": ("view", "report", "polish", "export"),
     "ask it": ("query", "embed"),
     "measure": ("evaluate", "score", "segment"),

@@ -1,29 +1,28 @@
 """Map what a robot sees: `emgs ros image:=/camera/image_raw camera_info:=/camera/camera_info … key=value`.
 
-It is `emgs run` over ROS 2 topics, with the map published while it grows.
+It is `emgs run` over topics of ROS 2, with the map published while it grows.
 """
 
-import sys
+from omegaconf import DictConfig
 
-from .command import words_of
-from .run import main as run
+from .command import command
+from .run import run_and_print
 
 
 def with_topics(arguments: list[str]) -> list[str]:
-    """The arguments of `emgs run` for the remappings (NAME:=TOPIC) and overrides of `emgs ros`; given keys win."""
-    topics = [word for word in arguments if ":=" in word]
+    """Replace the remappings (NAME:=TOPIC) among the arguments by the keys that they imply; given keys win."""
+    topics = [word.replace("'", "") for word in arguments if ":=" in word]  # `readable` has quoted the names
     given = [word for word in arguments if ":=" not in word]
-    names = {word.partition(":=")[0] for word in topics}
-    found = {"dataset": "camera", "dataset.source": "'" + " ".join(["ros", *topics]) + "'", "view": "ros"}
-    if {"depth", "odometry"} <= names:
-        found["prior"] = "stream"
-    keys = {word.partition("=")[0].lstrip("+") for word in words_of(given).overrides}
-    return [*(f"{key}={value}" for key, value in found.items() if key not in keys), *given]
+    found = [f"dataset.source='{' '.join(['ros', *topics])}'"]
+    if {"depth", "odometry"} <= {word.partition(":=")[0] for word in topics}:
+        found.append("prior=stream")
+    return [*found, *given]
 
 
-def main() -> None:
-    sys.argv[1:] = with_topics(sys.argv[1:])
-    run()
+@command("ros", rewritten=with_topics)
+def main(config: DictConfig) -> float:
+    """Run, and print the results."""
+    return run_and_print(config)
 
 
 if __name__ == "__main__":

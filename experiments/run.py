@@ -19,7 +19,7 @@ from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog, owned
 from emgs_jax.io.packages import extra
-from emgs_jax.live.capture import end_all
+from emgs_jax.live.newest import end_all
 from emgs_jax.mapping.capacity import prepared_beside
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.mapping.convert import to_camera
@@ -206,9 +206,8 @@ def _map(
     return run, raw
 
 
-@command("config", rewritten=with_source)
-def main(config: DictConfig) -> float:
-    """Run, print the results, and return the trajectory error (inf without one) for Hydra's sweepers."""
+def run_and_print(config: DictConfig) -> float:
+    """Run, print the results, and return the trajectory error (inf without one)."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     metrics = run(config, folder)
     print(metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
@@ -218,6 +217,12 @@ def main(config: DictConfig) -> float:
     print(f"{last_words(metrics)}everything is in {folder}, {REPORT_FILE} shows it")
     error = metrics.get("trajectory/ate_sim3_m")
     return math.inf if error is None else error
+
+
+@command("config", rewritten=with_source)
+def main(config: DictConfig) -> float:
+    """Run, and return the trajectory error for Hydra's sweepers."""
+    return run_and_print(config)
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ import emgs_jax
 from emgs_jax.config.overrides import readable
 from experiments.command import check_arguments
 from experiments.evaluate import delegated
+from experiments.ros import with_topics
 
 ROOT = CONF.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -76,6 +77,8 @@ def commands(page: Path) -> set[tuple[str, ...]]:
             given = [word for word in words if "=" in word and "…" not in word]
             if name == "run" and words and re.fullmatch(r"[\w/.]+", words[0]):  # what a video stands for
                 given = ["dataset=images", "prior=multiview_stereo", *given]
+            if name == "ros":
+                given = with_topics(given)
             if name == "evaluate":
                 has_suite = any(word.startswith("suite=") for word in given)
                 given = delegated(given if has_suite else ["suite=smoke", *given])

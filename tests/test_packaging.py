@@ -58,5 +58,5 @@ def test_every_command_is_listed_with_an_example_and_an_unknown_one_is_named(mon
     assert capsys.readouterr().out.rstrip() == usage()
     assert all(f"emgs {name} " in usage() for name in COMMANDS)
     monkeypatch.setattr("sys.argv", ["emgs", "fly"])
-    with pytest.raises(SystemExit, match="fly is no command of emgs: choose one of run, merge"):
+    with pytest.raises(SystemExit, match="fly is no command of emgs: choose one of run, ros, merge"):
         main()

@@ -22,7 +22,8 @@ from emgs_jax.data.intrinsics import Given, Pictures, find_lens
 from emgs_jax.data.reading import Size, about_pixels
 from emgs_jax.data.straightened import Straightened
 from emgs_jax.io.files import atomic_write
-from emgs_jax.live.capture import Newest, Shot, start
+from emgs_jax.live.capture import start
+from emgs_jax.live.newest import Newest, Shot
 
 RECORDED = "recorded"  # folder of a run
 FIRST_S, NEXT_S = 30.0, 10.0  # longest wait for the first image, and for each other one

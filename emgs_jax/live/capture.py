@@ -1,93 +1,26 @@
 """Images as they come: from a camera, an address of a stream, or a recording that is played in real time.
 
-A thread waits for the images and keeps the newest one until the map takes it: a queue would fall behind.
+A thread waits for the images, and `Newest` keeps one until the map takes it.
 """
 
 import os
 import threading
 import time
-import weakref
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
-import numpy as np
 
 from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.images import listed
 from emgs_jax.data.tones import read_shown
 from emgs_jax.data.video import VIDEO_SUFFIXES, Video
 from emgs_jax.io.npz import read_npz
+from emgs_jax.live.newest import Newest, Shot
 
 # Streams over TCP, each image as it comes: otherwise OpenCV lags by seconds (opencv#13145).
 RTSP_OPTIONS = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
 GIVEN = ("depth", "T_world_camera", "intrinsics", "confidence")  # arrays beside an image, as in files of prior=files
-
-
-@dataclass(frozen=True)
-class Shot:
-    """One image of a camera.
-
-    Args:
-        time: seconds, of the camera's own clock where it has one.
-        image: RGB, uint8 (h, w, 3).
-        given: what came with it, by the names in `GIVEN`: depth (h', w') in metres, 0 = none; T_world_camera (4, 4),
-            NaN where unknown; intrinsics of the depth, without them those of the image.
-        arrived: of `time.monotonic`.
-    """
-
-    time: float
-    image: np.ndarray
-    given: dict[str, np.ndarray] | None = None
-    arrived: float = 0.0
-
-
-class Newest:
-    """The newest image of a source, until it is taken; those that newer ones replace are counted.
-
-    Attributes:
-        num_dropped: images that came and were not taken.
-        reason: why no more will come; None while they may.
-    """
-
-    def __init__(self) -> None:
-        self._changed, self._shot = threading.Condition(), None
-        self.num_dropped, self.reason = 0, None
-
-    def put(self, shot: Shot) -> bool:
-        """Offer an image; returns False if no more are wanted."""
-        with self._changed:
-            if self.reason is not None:
-                return False
-            self.num_dropped += self._shot is not None
-            self._shot = replace(shot, arrived=time.monotonic())
-            self._changed.notify_all()
-            return True
-
-    def take(self, timeout_s: float) -> Shot | None:
-        """Wait for an image and take it; None after the last one, or if none comes in time."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._shot is not None or self.reason is not None, timeout_s)
-            shot, self._shot = self._shot, None
-            return shot
-
-    def end(self, reason: str) -> None:
-        """Let no more images come; the first reason stays."""
-        with self._changed:
-            self.reason = reason if self.reason is None else self.reason
-            self._changed.notify_all()
-
-
-_running: "weakref.WeakSet[Newest]" = weakref.WeakSet()  # cameras of this process
-
-
-def end_all() -> bool:
-    """Let the cameras of this process give no more images; returns False if none is running."""
-    running = [newest for newest in _running if newest.reason is None]
-    for newest in running:
-        newest.end("ended by the user")
-    return bool(running)
 
 
 def start(source: str, into: Newest) -> Calibration | None:
@@ -98,10 +31,8 @@ def start(source: str, into: Newest) -> Calibration | None:
     if source.split()[0] == "ros":
         from emgs_jax.live.ros import subscribe  # an extra
 
-        _running.add(into)
         return subscribe(source.split()[1:], into)
     shots = open_source(source)
-    _running.add(into)
     threading.Thread(target=_offer, args=(shots, source, into), name=f"camera {source}", daemon=True).start()
     return None
 

@@ -20,8 +20,8 @@ from emgs_jax.data.reading import rigid
 from emgs_jax.data.rosbag import calibration_of, to_rgb
 from emgs_jax.data.tones import ALL_16_BITS
 from emgs_jax.io.packages import extra
-from emgs_jax.live.capture import Newest, Shot
 from emgs_jax.live.joined_messages import Joined
+from emgs_jax.live.newest import Newest, Shot
 
 INFO_S = 30.0  # longest wait for the camera_info
 TOPICS = ("image", "camera_info", "depth", "odometry")

@@ -13,7 +13,7 @@ from emgs_jax.data.images import Images
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.live import camera, capture
 from emgs_jax.live.camera import Camera
-from emgs_jax.live.capture import Newest, Shot, end_all
+from emgs_jax.live.newest import Newest, Shot, end_all
 
 INTRINSICS = (40.0, 40.0, 15.5, 11.5)
 

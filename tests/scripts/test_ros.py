@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,22 +15,34 @@ import own_process
 import pytest
 from tiny_run import TINY, dataset
 
+from emgs_jax.config import configure
+from emgs_jax.live.ros import started
+from experiments.cli import explained
+from experiments.command import check_arguments
 from experiments.ros import with_topics
 
 OF_ROOM = [word for word in TINY if not word.startswith("dataset.")]
 TOPICS = ("image:=/robot/color/image", "camera_info:=/robot/color/info", "depth:=/robot/depth", "odometry:=/robot/odom")
 
 
-def test_topics_are_the_source_of_a_camera_and_depth_with_odometry_is_the_prior():
+def test_topics_are_the_source_of_a_camera_and_depth_with_odometry_is_the_prior(monkeypatch, capsys):
     found = with_topics([*TOPICS, "dataset.size=[64,48]"])
-    assert found == [
-        "dataset=camera",
-        f"dataset.source='ros {' '.join(TOPICS)}'",
-        "view=ros",
-        "prior=stream",
-        "dataset.size=[64,48]",
-    ]
-    assert "prior=stream" not in with_topics(TOPICS[:2]) and "view=ros" not in with_topics([*TOPICS, "view=none"])
+    assert found == [f"dataset.source='ros {' '.join(TOPICS)}'", "prior=stream", "dataset.size=[64,48]"]
+    check_arguments("ros", found)
+    config = configure.compose(*found, name="ros")
+    assert config.dataset.source == f"ros {' '.join(TOPICS)}" and config.prior._target_.endswith("Stream")
+    assert config.view._target_.endswith("RosConfig")
+    assert with_topics(TOPICS[:2]) == [f"dataset.source='ros {' '.join(TOPICS[:2])}'"]
+    monkeypatch.setattr(sys, "argv", ["emgs ros", "--help"])
+    explained("ros")()
+    for example in re.findall(r"^  emgs ros (.*)", capsys.readouterr().out, re.MULTILINE):
+        check_arguments("ros", with_topics(example.split()))
+
+
+def test_a_word_that_is_no_remapping_is_named(monkeypatch):
+    monkeypatch.setattr("emgs_jax.live.ros.extra", lambda *words: None)
+    with pytest.raises(ValueError, match=r"picture:=/a is no remapping NAME:=TOPIC of one of image, camera_info"):
+        started(["picture:=/a"])
 
 
 @pytest.fixture

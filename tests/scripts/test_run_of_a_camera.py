@@ -15,7 +15,7 @@ import experiments.run
 from emgs_jax.config import configure
 from emgs_jax.io.trajectory import load_trajectory_tum
 from emgs_jax.live import capture
-from emgs_jax.live.capture import Shot
+from emgs_jax.live.newest import Shot
 
 pytestmark = pytest.mark.xdist_group("tiny")
 

@@ -1,0 +1,122 @@
+"""Messages of one moment, in any order; what their bytes mean. Oracles: what was written into them."""
+
+from array import array
+from types import SimpleNamespace
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.data.base import BadFrameError
+from emgs_jax.live import joined_messages
+from emgs_jax.live.joined_messages import Joined, pose_at
+from emgs_jax.live.ros import depth_of, image_of, pose_of, stamp_of
+
+
+def at(x: float, degrees: float = 0.0) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.from_euler("z", degrees, degrees=True).as_matrix()
+    pose[0, 3] = x
+    return pose
+
+
+def test_an_image_alone_is_whole_at_once():
+    joined = Joined(set())
+    assert [*joined.add("image", 1.0, "a")] == [(1.0, {"image": "a"})] and joined.num_alone == 0
+
+
+def test_an_image_waits_for_its_depth_and_for_the_pose_after_it():
+    joined = Joined({"depth", "pose"})
+    assert not [*joined.add("pose", 0.9, at(0.0))] and not [*joined.add("image", 1.0, "a")]
+    assert not [*joined.add("depth", 0.95, "of another")], "50 ms apart is another moment"
+    assert not [*joined.add("depth", 1.01, "its own")]
+    ((time_s, found),) = joined.add("pose", 1.1, at(2.0, 90.0))
+    assert time_s == 1.0 and found["image"] == "a" and found["depth"] == "its own"
+    np.testing.assert_allclose(found["pose"], at(1.0, 45.0), atol=1e-9)
+
+
+def test_what_becomes_whole_later_comes_in_order_of_time_and_what_does_not_is_counted():
+    joined = Joined({"depth"})
+    for number in range(4):
+        assert not [*joined.add("image", float(number), number)]
+    assert [found["image"] for _, found in joined.add("depth", 1.0, "d")] == [1]
+    assert joined.num_alone == 1, "the first one's depth never came"
+    joined._waiting["depth"].append((3.0, "early"))
+    assert [found["image"] for _, found in joined.add("depth", 2.0, "d")] == [2, 3]
+
+
+def test_messages_that_nothing_fits_do_not_pile_up(monkeypatch):
+    monkeypatch.setattr(joined_messages, "MAX_WAITING", 3)
+    joined = Joined({"depth"})
+    for number in range(10):
+        assert not [*joined.add("image", float(number), number)]
+        assert not [*joined.add("depth", number + 0.5, "of no image")]
+    assert len(joined._waiting["image"]) <= 4 and len(joined._waiting["depth"]) <= 4 and joined.num_alone >= 6
+
+
+def test_no_pose_is_guessed_outside_of_the_list_or_in_a_large_gap():
+    poses = [(1.0, at(1.0)), (1.2, at(2.0)), (3.0, at(3.0))]
+    assert pose_at(poses, 0.9) is None and pose_at(poses, 3.1) is None and pose_at([], 1.0) is None
+    assert pose_at(poses, 2.0) is None, "1.8 s lie between the two"
+    np.testing.assert_array_equal(pose_at(poses, 3.0), at(3.0))
+    np.testing.assert_allclose(pose_at(poses, 1.05), at(1.25), atol=1e-9)
+
+
+def message(values: np.ndarray, encoding: str, padding: int = 0, big: bool = False):
+    """An Image whose rows have `padding` bytes at their end."""
+    height, width = values.shape[:2]
+    values = values.astype(values.dtype.newbyteorder(">" if big else "<"))
+    rows = np.ascontiguousarray(values).view(np.uint8).reshape(height, -1)
+    rows = np.pad(rows, ((0, 0), (0, padding)), constant_values=255)
+    facts = {"height": height, "width": width, "encoding": encoding, "step": rows.shape[1], "is_bigendian": big}
+    return SimpleNamespace(**facts, data=array("B", rows.tobytes()))
+
+
+RGB = np.random.default_rng(0).integers(0, 256, (6, 8, 3), np.uint8)
+
+
+@pytest.mark.parametrize("padding", [0, 4])
+def test_images_are_read_in_every_encoding(padding):
+    np.testing.assert_array_equal(image_of(message(RGB, "rgb8", padding)), RGB)
+    np.testing.assert_array_equal(image_of(message(RGB[..., ::-1], "bgr8", padding)), RGB)
+    np.testing.assert_array_equal(image_of(message(RGB[..., 0], "mono8", padding)), RGB[..., [0, 0, 0]])
+    data = cv2.imencode(".png", RGB[..., ::-1])[1].tobytes()
+    np.testing.assert_array_equal(image_of(SimpleNamespace(format="png", data=data)), RGB)
+    with pytest.raises(BadFrameError, match="encoding 'yuv422'"):
+        image_of(message(RGB, "yuv422"))
+
+
+@pytest.mark.parametrize("first", ["rggb", "bggr", "gbrg", "grbg"])
+def test_bayer_images_have_the_colours_of_their_pattern(first):
+    """One colour everywhere: each pixel of the sensor shows its own channel of it."""
+    color = {"r": 200, "g": 120, "b": 40}
+    raw = np.empty((8, 8), np.uint8)
+    for place, name in enumerate(first):
+        raw[place // 2 :: 2, place % 2 :: 2] = color[name]
+    found = image_of(message(raw, f"bayer_{first}8"))
+    np.testing.assert_array_equal(found[2:-2, 2:-2], np.broadcast_to([200, 120, 40], (4, 4, 3)))
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_depths_are_metres_and_0_where_there_is_none(big):
+    np.testing.assert_allclose(
+        depth_of(message(np.array([[0, 1500], [65535, 2]], np.uint16), "16UC1", 2, big)),
+        [[0, 1.5], [65.535, 0.002]],
+        rtol=1e-6,
+    )
+    raw = np.array([[np.nan, 1.5], [-1.0, np.inf]], np.float32)
+    np.testing.assert_array_equal(depth_of(message(raw, "32FC1", 4, big)), np.float32([[0, 1.5], [0, 0]]))
+    with pytest.raises(BadFrameError, match="encoding 'rgb8'"):
+        depth_of(message(RGB, "rgb8"))
+
+
+def test_a_pose_and_a_stamp_are_those_of_the_message():
+    turn = Rotation.from_euler("xyz", [10, 20, 30], degrees=True)
+    x, y, z, w = turn.as_quat()
+    place, quaternion = SimpleNamespace(x=1.0, y=2.0, z=3.0), SimpleNamespace(x=x, y=y, z=z, w=w)
+    inner = SimpleNamespace(position=place, orientation=quaternion)
+    stamp = SimpleNamespace(sec=12, nanosec=250_000_000)
+    odometry = SimpleNamespace(pose=SimpleNamespace(pose=inner), header=SimpleNamespace(stamp=stamp))
+    np.testing.assert_allclose(pose_of(odometry)[:3, :3], turn.as_matrix(), atol=1e-12)
+    assert pose_of(odometry)[:3, 3].tolist() == [1, 2, 3] and stamp_of(odometry) == 12.25
