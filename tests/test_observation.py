@@ -237,9 +237,10 @@ def test_a_pose_whose_quaternion_is_none_is_unknown_and_one_that_is_too_long_or_
     """Of a matrix rigid to three decimals: each frame multiplied the length of all poses after it by its own."""
     values = np.float32([[1, 0, 0, 0, 1, 2, 3], [0, 0, 0, 0, 1, 2, 3], [1, 0, 0, 0, 1e30, 2, 3], [np.nan] * 7])
     turned = np.float32([0.1, 0.5, 0.7, 0.5, 1, 2, 3])
-    values = np.concatenate([values, [turned * [f, f, f, f, 1, 1, 1] for f in (0.97, 1.0, 1.03)]]).astype(np.float32)
+    lengths = 0.97, 1.0, 1.03, 0.9, 1.1  # the last two are too far from a unit for a rounded one
+    values = np.concatenate([values, [turned * [f, f, f, f, 1, 1, 1] for f in lengths]]).astype(np.float32)
     found = on_host(observation.sound_poses)(jaxlie.SE3(values)).wxyz_xyz
-    np.testing.assert_array_equal(np.isfinite(found).all(axis=1), [True] + [False] * 3 + [True] * 3)
+    np.testing.assert_array_equal(np.isfinite(found).all(axis=1), [True] + [False] * 3 + [True] * 3 + [False] * 2)
     np.testing.assert_array_equal(found[[0, 5]], values[[0, 5]])
     np.testing.assert_allclose(found[[4, 6]], [turned] * 2, rtol=1e-6)
 
