@@ -170,6 +170,17 @@ def test_a_point_without_a_normal_is_no_measurement_and_its_row_is_neutral(camer
     assert not any(np.asarray(x[gone]).any() for x in (o.colors, o.features, o.normals))
 
 
+def test_what_a_surface_is_known_by_is_what_an_observation_keeps(camera, config):
+    """Holes, a point behind the camera, one beyond any map and one alone; colours and confidence have no say."""
+    points, colors, features, confidence, mask = example(camera)
+    mask[9:14, 9:14], mask[11, 11] = False, True
+    points[3, 4, 2], points[20, 21], points[15, 20:] = -1.0, 1e30, [0, 0, 0]
+    settings = config().observation
+    expected = np.asarray(observe(points, colors, features, confidence, mask, settings).valid).reshape(24, 32)
+    np.testing.assert_array_equal(on_host(observation.known_surface)(points, mask, settings), expected)
+    assert 0.9 < expected.mean() < 1 - 25 / 768
+
+
 def test_the_least_confidence_is_enough_and_a_point_at_depth_zero_is_none(camera, config):
     points, colors, features, confidence, mask = example(camera)
     confidence[4, 5] = 1.0

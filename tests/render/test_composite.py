@@ -10,6 +10,7 @@ import reference
 import scene as sc
 
 from emgs_jax.gaussians import Gaussians
+from emgs_jax.render import tiles
 from emgs_jax.render.composite import render, splat_depth
 from emgs_jax.render.project import Splats
 
@@ -100,9 +101,17 @@ def test_a_steep_plane_is_drawn_no_farther_and_no_nearer_than_its_gaussian_reach
     assert (expected.min(axis=1) == nearest).all() and (expected.max(axis=1) == farthest).all()
 
 
+@pytest.fixture
+def in_parts(config, monkeypatch):
+    """Chunks of four splats, three of them at once: a tile has several, and a look at the lists takes many turns."""
+    monkeypatch.setattr(tiles, "CHUNK", 4)
+    return config("render.tile_batch=3").refinement.render
+
+
 @pytest.mark.parametrize("size", [5, 32])
-def test_the_image_does_not_depend_on_the_tile_size(camera, config, image, size):
-    other = config(f"render.tile_size={size}").refinement.render
+def test_the_image_does_not_depend_on_the_size_of_tiles_and_parts(camera, config, image, size, monkeypatch):
+    monkeypatch.setattr(tiles, "CHUNK", {5: 4, 32: 32}[size])
+    other = config(f"render.tile_size={size}", f"render.tile_batch={size - 2}").refinement.render
     assert_images_equal(draw(GAUSSIANS, GAUSSIANS.colors, T, camera, other), image, 2e-5)  # order of sums
 
 
@@ -125,7 +134,7 @@ def inputs(g, T):
     return g.means, g.covs, g.normals, g.colors, T.translation()
 
 
-def test_the_gradient_of_an_image_is_that_of_the_tile_free_reference(camera, render_config, image):
+def test_the_gradient_of_an_image_is_that_of_the_tile_free_reference(camera, in_parts, image):
     """By each input alone, along a random change of it: differences in float64.
 
     Splats change places in depth and pixels leave splats in jumps, which have no slope and which no small step meets.
@@ -137,7 +146,7 @@ def test_the_gradient_of_an_image_is_that_of_the_tile_free_reference(camera, ren
     weights = [rng.normal(size=(*shape, 3)), *rng.normal(size=(3, *shape))]
     weights[2:] = weights[2] * is_deep, weights[3] * (is_deep & is_thick)
     given = [np.asarray(x, float) for x in inputs(GAUSSIANS, T)]
-    found = slopes(inputs(GAUSSIANS, T), GAUSSIANS, T, tuple(map(sc.device, weights)), camera, render_config)
+    found = slopes(inputs(GAUSSIANS, T), GAUSSIANS, T, tuple(map(sc.device, weights)), camera, in_parts)
     for number, name in enumerate(("means", "covs", "normals", "colors", "position")):
         change = rng.normal(size=given[number].shape)
         if name == "covs":
@@ -149,19 +158,19 @@ def test_the_gradient_of_an_image_is_that_of_the_tile_free_reference(camera, ren
             )
             g, pose = sc.as_numpy(GAUSSIANS) | {"means": means, "covs": covs, "normals": normals}, sc.matrix_of(T)
             pose[:3, 3] = position
-            images = reference.render(g, colors, pose, camera, render_config)
+            images = reference.render(g, colors, pose, camera, in_parts)
             return sum(np.sum(weight * x) for weight, x in zip(weights, images, strict=True))
 
         expected = (total(1) - total(-1)) / (2 * step)
         assert np.sum(found[number] * change) == pytest.approx(expected, rel=1e-4), name  # float32: 1e-5 is seen
 
 
-def test_a_free_row_where_the_camera_is_leaves_every_gradient_finite(camera, render_config):
+def test_a_free_row_where_the_camera_is_leaves_every_gradient_finite(camera, in_parts):
     """Free rows are at the origin; a camera there is at depth 0 of them."""
     is_free = np.arange(COUNT) < 4
     free = sc.replace(GAUSSIANS, valid=~is_free, means=np.where(is_free[:, None], 0.0, GAUSSIANS.means))
     ones = tuple(sc.device(np.ones(shape)) for shape in ((24, 32, 3), *[(24, 32)] * 3))
-    found = slopes(inputs(free, sc.pose()), free, sc.pose(), ones, camera, render_config)
+    found = slopes(inputs(free, sc.pose()), free, sc.pose(), ones, camera, in_parts)
     assert all(np.isfinite(x).all() for x in found)
 
 
