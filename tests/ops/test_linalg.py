@@ -166,6 +166,7 @@ def test_whitening_keeps_all_that_a_flat_covariance_says(ratio):
 
 
 def test_a_covariance_flatter_than_float32_holds_is_flat_and_not_the_identity():
-    covs = np.concatenate([spd(500, 3, (1.0, 0.7, 1e-5)), [np.diag(np.roll([1.0, 0.7, 0.0], i)) for i in range(3)]])
+    flat = [np.diag(np.roll(variances, i)) for i in range(3) for variances in ([1.0, 0.7, 0.0], [1.0, 0.0, 0.0])]
+    covs = np.concatenate([spd(500, 3, (1.0, 0.7, 1e-5)), flat])
     triangle = whitening(np.float32(0.5 * (covs + covs.mT)))[0]
     assert (triangle[:, [0, 2, 5]].max(axis=1) > 100).all()  # the last axis may lie nearly in the surface
