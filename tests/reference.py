@@ -270,12 +270,13 @@ def is_drawn(mean, cov, normal, pose, scale):
 
 
 def plane_depth(pixel, point, normal, reach, camera):
-    """Depth at a pixel of the plane through a camera-frame point, kept within `reach` of the point's own."""
-    ray = np.append((pixel - np.asarray(camera.center, float)) / np.asarray(camera.focal, float), 1.0)
+    """Depth at pixels (*b, 2) of the plane through a camera-frame point, kept within `reach` of the point's own."""
+    ray = (pixel - np.asarray(camera.center, float)) / np.asarray(camera.focal, float)
+    ray = np.concatenate([ray, np.ones((*ray.shape[:-1], 1))], axis=-1)
     # In inverse depth: beyond its horizon a plane is infinitely far, not behind the camera.
     # A plane that is seen at a grazing angle (cosine below .1) has its mean's depth everywhere.
     is_grazing = abs(normal @ point) <= 0.1 * np.linalg.norm(point)
-    inverse = 1 / point[2] if is_grazing else (normal @ ray) / (normal @ point)
+    inverse = 1 / point[2] if is_grazing else (ray @ normal) / (normal @ point)
     return 1 / np.clip(inverse, 1 / (point[2] + reach), 1 / max(point[2] - reach, 0.1 * point[2]))
 
 
@@ -284,6 +285,7 @@ def render(g, values, pose, camera, config):
     shape = camera.height, camera.width
     light, image, alpha, depth = np.ones(shape), np.zeros((*shape, values.shape[1])), np.zeros(shape), np.zeros(shape)
     depth_sq, scale, radius = np.zeros(shape), float(config.covariance_scale), float(config.radius)
+    pixels = np.stack(np.meshgrid(np.arange(shape[1]), np.arange(shape[0])), axis=-1).astype(float)
     rows = [k for k in range(len(g["means"])) if g["valid"][k]]
     rows = [k for k in rows if is_drawn(g["means"][k], g["covs"][k], g["normals"][k], pose, scale)]
     depth_of = {k: (pose[:3, :3].T @ (g["means"][k] - pose[:3, 3]))[2] for k in rows}
@@ -291,19 +293,15 @@ def render(g, values, pose, camera, config):
         pixel, cov_2d, point, cov = splat(g["means"][k], g["covs"][k], pose, camera, scale, float(config.blur))
         normal, reach = pose[:3, :3].T @ g["normals"][k], radius * np.sqrt(cov[2, 2])
         precision = np.linalg.inv(cov_2d)
-        for row in range(shape[0]):
-            for column in range(shape[1]):
-                offset = np.array([column, row]) - pixel
-                distance_sq = offset @ precision @ offset
-                if distance_sq > radius**2:
-                    continue
-                weight = light[row, column] * float(config.opacity) * np.exp(-0.5 * distance_sq)
-                z = plane_depth(np.array([column, row]), point, normal, reach, camera)
-                image[row, column] += weight * values[k]
-                depth[row, column] += weight * z
-                depth_sq[row, column] += weight * z**2
-                alpha[row, column] += weight
-                light[row, column] -= weight
+        offset = pixels - pixel
+        distance_sq = np.einsum("yxi,ij,yxj->yx", offset, precision, offset)
+        weight = np.where(distance_sq > radius**2, 0.0, light * float(config.opacity) * np.exp(-0.5 * distance_sq))
+        z = plane_depth(pixels, point, normal, reach, camera)
+        image += weight[..., None] * values[k]
+        depth += weight * z
+        depth_sq += weight * z**2
+        alpha += weight
+        light -= weight
     is_covered, total = alpha >= config.min_alpha, np.maximum(alpha, 1e-9)
     mean = np.where(is_covered, depth / total, 0.0)
     return image, alpha, mean, np.sqrt(np.where(is_covered, np.maximum(depth_sq / total - mean**2, 0), 0.0))

@@ -3,6 +3,7 @@
 import ast
 import dataclasses
 import inspect
+import math
 import re
 import typing
 from functools import cache
@@ -249,6 +250,25 @@ def test_every_number_of_a_config_class_declares_its_range():
         if numeric.search(str(field.type)) and not {"range", "choices"} & field.metadata.keys()
     ]
     assert sorted(without) == ["ImageConfig.mean", "ImageConfig.std"], "colours: any finite number"
+
+
+SHARES = {"cosine_weight", "forgetting", "min_alpha", "min_inlier_fraction", "opacity", "pose_shared"}
+
+
+def test_a_gate_can_be_closed_a_share_is_from_none_to_all_and_a_cosine_at_most_one():
+    ranges = {
+        f"{module.__module__}.{field.name}": field.metadata["range"]
+        for module in config_classes()
+        for field in dataclasses.fields(module)
+        if "range" in field.metadata and ".polish." not in module.__module__  # whose opacity is a logit's
+    }
+    of = lambda is_meant: {key: r for key, r in ranges.items() if is_meant(key.split(".")[-1])}  # noqa: E731
+    shares, cosines = of(SHARES.__contains__), of(lambda name: name.endswith("_cos"))
+    gates = of(re.compile(r"max_.*(_sq|_gap|_step|_rad|_std|_distance|residual|misfit|field|margin|_odds)").match)
+    assert len(shares) > 6 and len(cosines) > 6 and len(gates) > 12
+    assert {key: (r.low, r.high) for key, r in shares.items()} == dict.fromkeys(shares, (0, 1))
+    assert all(r.high == 1 and r.low in (-1, 0, -math.inf) for r in cosines.values())
+    assert {key: r.low for key, r in gates.items()} == dict.fromkeys(gates, 0)
 
 
 def test_a_value_that_stands_in_a_constructor_too_is_the_same_there():

@@ -188,3 +188,15 @@ def test_the_moment_matched_blend_has_the_moments_of_the_mixture():
         away = part["means"] - means
         expected += share[:, None, None] * (part["covs"] + away[:, :, None] * away[:, None])
     np.testing.assert_allclose(found.covs, expected, atol=1e-6)
+
+
+def test_colours_and_normals_blend_by_the_gain_and_features_stay():
+    old, new, gain = sc.as_numpy(OLD), sc.as_numpy(NEW), np.array([0.1, 0.3, 0.5, 0.8, 0.0, 1.0])
+    found = between(gain, 0.0)
+    for name in ("colors", "covs", "normals"):
+        share = gain.reshape(6, *[1] * (old[name].ndim - 1))
+        expected = (1 - share) * old[name] + share * new[name]
+        if name == "normals":
+            expected /= np.linalg.norm(expected, axis=1, keepdims=True)
+        np.testing.assert_allclose(getattr(found, name), expected, atol=1e-6)
+    sc.assert_same(found.features, OLD.features)

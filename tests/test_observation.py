@@ -170,6 +170,17 @@ def test_a_point_without_a_normal_is_no_measurement_and_its_row_is_neutral(camer
     assert not any(np.asarray(x[gone]).any() for x in (o.colors, o.features, o.normals))
 
 
+def test_what_a_surface_is_known_by_is_what_an_observation_keeps(camera, config):
+    """Holes, a point behind the camera, one beyond any map and one alone; colours and confidence have no say."""
+    points, colors, features, confidence, mask = example(camera)
+    mask[9:14, 9:14], mask[11, 11] = False, True
+    points[3, 4, 2], points[20, 21], points[15, 20:] = -1.0, 1e30, [0, 0, 0]
+    settings = config().observation
+    expected = np.asarray(observe(points, colors, features, confidence, mask, settings).valid).reshape(24, 32)
+    np.testing.assert_array_equal(on_host(observation.known_surface)(points, mask, settings), expected)
+    assert 0.9 < expected.mean() < 1 - 25 / 768
+
+
 def test_the_least_confidence_is_enough_and_a_point_at_depth_zero_is_none(camera, config):
     points, colors, features, confidence, mask = example(camera)
     confidence[4, 5] = 1.0
@@ -237,9 +248,10 @@ def test_a_pose_whose_quaternion_is_none_is_unknown_and_one_that_is_too_long_or_
     """Of a matrix rigid to three decimals: each frame multiplied the length of all poses after it by its own."""
     values = np.float32([[1, 0, 0, 0, 1, 2, 3], [0, 0, 0, 0, 1, 2, 3], [1, 0, 0, 0, 1e30, 2, 3], [np.nan] * 7])
     turned = np.float32([0.1, 0.5, 0.7, 0.5, 1, 2, 3])
-    values = np.concatenate([values, [turned * [f, f, f, f, 1, 1, 1] for f in (0.97, 1.0, 1.03)]]).astype(np.float32)
+    lengths = 0.97, 1.0, 1.03, 0.9, 1.1  # the last two are too far from a unit for a rounded one
+    values = np.concatenate([values, [turned * [f, f, f, f, 1, 1, 1] for f in lengths]]).astype(np.float32)
     found = on_host(observation.sound_poses)(jaxlie.SE3(values)).wxyz_xyz
-    np.testing.assert_array_equal(np.isfinite(found).all(axis=1), [True] + [False] * 3 + [True] * 3)
+    np.testing.assert_array_equal(np.isfinite(found).all(axis=1), [True] + [False] * 3 + [True] * 3 + [False] * 2)
     np.testing.assert_array_equal(found[[0, 5]], values[[0, 5]])
     np.testing.assert_allclose(found[[4, 6]], [turned] * 2, rtol=1e-6)
 

@@ -85,6 +85,26 @@ def test_the_inverse_of_2x2_equals_numpy_and_is_zero_where_singular():
     np.testing.assert_array_equal(inverse_2x2(np.ones((2, 2), np.float32)), np.zeros((2, 2)))
 
 
+def test_the_inverse_of_2x2_keeps_all_that_a_flat_covariance_says():
+    """As float32 holds it: of widths of 1 and 1/3,000 the products of the determinant differ in their last digits."""
+    covs = np.float32(spd(200, 2, (1.0, 1 / 3000)))
+    covs[:, 1, 0] = covs[:, 0, 1]
+    exact = np.linalg.inv(covs.astype(float))
+    size = np.abs(exact).max(axis=(1, 2), keepdims=True)
+    is_positive = np.linalg.det(covs.astype(float)) > 0  # rounded entries may be indefinite
+    assert is_positive.mean() > 0.9
+    np.testing.assert_allclose((inverse_2x2(covs) / size)[is_positive], (exact / size)[is_positive], atol=1e-5)
+
+
+def test_a_floor_is_a_variance_more_and_outweighs_the_rounding_of_a_very_wide_covariance():
+    covs, floored = spd(20, 3, (0.1, 0.2, 0.01)), on_host(linalg.floored)
+    found = floored(np.float32(covs), np.float32(0.05))
+    np.testing.assert_allclose(found, covs + 0.05**2 * np.eye(3), atol=1e-7)  # roundings of a 20th
+    wide = np.float32(spd(200, 3, (1e3, 300.0, 0.0)))
+    smallest = np.linalg.eigvalsh(floored(0.5 * (wide + wide.mT), np.float32(1e-3)).astype(float))[:, 0]
+    assert (smallest > 0).all() and (smallest < 1.0).all()  # a part in a million of 1e6 m²
+
+
 def test_mahalanobis_is_squared_and_never_negative():
     assert mahalanobis_sq(np.float32([2, 0, 3]), np.float32(np.diag([1, 1, 4]))) == 40
     assert mahalanobis_sq(np.float32([1, 0, 0]), np.float32(-np.eye(3))) == 0
@@ -146,6 +166,7 @@ def test_whitening_keeps_all_that_a_flat_covariance_says(ratio):
 
 
 def test_a_covariance_flatter_than_float32_holds_is_flat_and_not_the_identity():
-    covs = np.concatenate([spd(500, 3, (1.0, 0.7, 1e-5)), [np.diag(np.roll([1.0, 0.7, 0.0], i)) for i in range(3)]])
+    flat = [np.diag(np.roll(variances, i)) for i in range(3) for variances in ([1.0, 0.7, 0.0], [1.0, 0.0, 0.0])]
+    covs = np.concatenate([spd(500, 3, (1.0, 0.7, 1e-5)), flat])
     triangle = whitening(np.float32(0.5 * (covs + covs.mT)))[0]
     assert (triangle[:, [0, 2, 5]].max(axis=1) > 100).all()  # the last axis may lie nearly in the surface

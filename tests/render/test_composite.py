@@ -1,5 +1,6 @@
 """The rasteriser against a tile-free NumPy renderer, and identities that any renderer must satisfy."""
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import jaxlie
@@ -9,6 +10,7 @@ import reference
 import scene as sc
 
 from emgs_jax.gaussians import Gaussians
+from emgs_jax.render import tiles
 from emgs_jax.render.composite import render, splat_depth
 from emgs_jax.render.project import Splats
 
@@ -99,24 +101,77 @@ def test_a_steep_plane_is_drawn_no_farther_and_no_nearer_than_its_gaussian_reach
     assert (expected.min(axis=1) == nearest).all() and (expected.max(axis=1) == farthest).all()
 
 
+@pytest.fixture
+def in_parts(config, monkeypatch):
+    """Chunks of four splats, three of them at once: a tile has several, and a look at the lists takes many turns."""
+    monkeypatch.setattr(tiles, "CHUNK", 4)
+    return config("render.tile_batch=3").refinement.render
+
+
 @pytest.mark.parametrize("size", [5, 32])
-def test_the_image_does_not_depend_on_the_tile_size(camera, config, image, size):
-    other = config(f"render.tile_size={size}").refinement.render
+def test_the_image_does_not_depend_on_the_size_of_tiles_and_parts(camera, config, image, size, monkeypatch):
+    monkeypatch.setattr(tiles, "CHUNK", {5: 4, 32: 32}[size])
+    other = config(f"render.tile_size={size}", f"render.tile_batch={size - 2}").refinement.render
     assert_images_equal(draw(GAUSSIANS, GAUSSIANS.colors, T, camera, other), image, 2e-5)  # order of sums
 
 
-def test_a_free_row_where_the_camera_is_leaves_the_gradient_of_the_pose_finite(camera, render_config):
+@sc.on_host
+def slopes(changing, gaussians, T_world_camera, weights, camera, config):
+    """Of the weighted sum of all images, by the Gaussians' means, covariances and normals, colours and the position."""
+
+    def total(changing):
+        *rows, colors, position = changing
+        g = eqx.tree_at(lambda g: (g.means, g.covs, g.normals), gaussians, rows)
+        there = jaxlie.SE3.from_rotation_and_translation(T_world_camera.rotation(), position)
+        drawn = render(g, colors, there, camera, config)
+        images = drawn.values, drawn.alpha, drawn.depth, drawn.depth_std
+        return sum(jnp.sum(weight * image) for weight, image in zip(weights, images, strict=True))
+
+    return jax.grad(total)(changing)
+
+
+def inputs(g, T):
+    return g.means, g.covs, g.normals, g.colors, T.translation()
+
+
+def test_the_gradient_of_an_image_is_that_of_the_tile_free_reference(camera, in_parts, image):
+    """By each input alone, along a random change of it: differences in float64.
+
+    Splats change places in depth and pixels leave splats in jumps, which have no slope and which no small step meets.
+    Depth counts where enough is drawn and its deviation is no rounding.
+    """
+    rng, step = np.random.default_rng(0), 1e-6
+    shape = camera.height, camera.width
+    is_deep, is_thick = np.asarray(image.alpha) > 0.4, np.asarray(image.depth_std) > 0.1
+    weights = [rng.normal(size=(*shape, 3)), *rng.normal(size=(3, *shape))]
+    weights[2:] = weights[2] * is_deep, weights[3] * (is_deep & is_thick)
+    given = [np.asarray(x, float) for x in inputs(GAUSSIANS, T)]
+    found = slopes(inputs(GAUSSIANS, T), GAUSSIANS, T, tuple(map(sc.device, weights)), camera, in_parts)
+    for number, name in enumerate(("means", "covs", "normals", "colors", "position")):
+        change = rng.normal(size=given[number].shape)
+        if name == "covs":
+            change = given[number] * rng.normal(size=(COUNT, 1, 1))  # each as a whole, so that it stays one
+
+        def total(sign, number=number, change=change):
+            means, covs, normals, colors, position = (
+                x + sign * step * change if i == number else x for i, x in enumerate(given)
+            )
+            g, pose = sc.as_numpy(GAUSSIANS) | {"means": means, "covs": covs, "normals": normals}, sc.matrix_of(T)
+            pose[:3, 3] = position
+            images = reference.render(g, colors, pose, camera, in_parts)
+            return sum(np.sum(weight * x) for weight, x in zip(weights, images, strict=True))
+
+        expected = (total(1) - total(-1)) / (2 * step)
+        assert np.sum(found[number] * change) == pytest.approx(expected, rel=1e-4), name  # float32: 1e-5 is seen
+
+
+def test_a_free_row_where_the_camera_is_leaves_every_gradient_finite(camera, in_parts):
     """Free rows are at the origin; a camera there is at depth 0 of them."""
     is_free = np.arange(COUNT) < 4
     free = sc.replace(GAUSSIANS, valid=~is_free, means=np.where(is_free[:, None], 0.0, GAUSSIANS.means))
-    ahead = sc.pose()
-
-    def total(shift):
-        there = jaxlie.SE3.from_rotation_and_translation(ahead.rotation(), shift)
-        drawn = render(free, free.colors, there, camera, render_config)
-        return jnp.sum(drawn.values) + jnp.sum(drawn.depth) + jnp.sum(drawn.depth_std)
-
-    assert np.isfinite(sc.on_host(jax.grad(total))(np.zeros(3, np.float32))).all()
+    ones = tuple(sc.device(np.ones(shape)) for shape in ((24, 32, 3), *[(24, 32)] * 3))
+    found = slopes(inputs(free, sc.pose()), free, sc.pose(), ones, camera, in_parts)
+    assert all(np.isfinite(x).all() for x in found)
 
 
 MANY = discs(*(((0.0, 0.0, 1.0 + 0.05 * i), (0, 0, -1), 30.0) for i in range(COUNT)))  # each fills the image

@@ -74,6 +74,7 @@ def test_a_gaussian_has_a_depth_slope_from_a_cosine_of_a_tenth_on(camera, cosine
 def test_a_gaussian_that_is_not_in_front_is_invalid_and_finite(camera, z):
     splats = project(all_with(means=[0.3, -0.2, z]), pose(), camera, SCALE, BLUR)
     assert not splats.valid.any()
+    np.testing.assert_allclose(splats.depth, z if z > 0 else 1.0, rtol=1e-6)
     assert all(np.isfinite(x).all() for x in jax.tree.leaves(splats))
 
 
