@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,7 +14,7 @@ from jaxtyping import Bool
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
-from emgs_jax.data.file_names import IMAGE_SUFFIXES
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_numbering, frame_name
 from emgs_jax.data.labels import LabelFolder
 from emgs_jax.ops.ranges import ranged
 
@@ -50,7 +50,7 @@ class Masks:
         return LabelFolder(Path(self.folder).expanduser(), Path(self.names).expanduser(), None)
 
     @cached_property
-    def _paths(self) -> list[Path]:
+    def paths(self) -> list[Path]:
         """All images in the folder and below."""
         found = sorted(Path(self.folder).expanduser().rglob("*"))
         return [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")]
@@ -68,13 +68,13 @@ class Masks:
         if self.folder is None:
             return [None] * len(images)
         by_end, found = defaultdict(list), []
-        for path in self._paths:
+        for path in self.paths:
             parts = path.relative_to(Path(self.folder).expanduser()).parts
             for begin in range(len(parts)):
                 by_end[(*parts[begin:-1], path.stem)].append(path)
         for image, number in zip(images, numbers, strict=True):
             if image is None:
-                ends = [(f"{number:06d}",)]
+                ends = [(frame_name(number),)]
             else:  # the longest path that a mask ends with; COLMAP's are called NAME.png.png
                 above = image.parts[:-1]
                 ends = [(*above[row:], name) for row in range(len(above) + 1) for name in (image.stem, image.name)]
@@ -82,7 +82,7 @@ class Masks:
         missing = [row for row, path in enumerate(found) if path is None]
         if missing:
             image = images[missing[0]]
-            name = f"{numbers[missing[0]]:06d}" if image is None else image.stem
+            name = frame_name(numbers[missing[0]]) if image is None else image.stem
             raise ValueError(
                 f"masks.folder={self.folder} has no mask for {name} (and {len(missing) - 1} more): give a "
                 f"folder with one image for each frame, {name}.png"
@@ -96,7 +96,7 @@ class Masks:
 
     def _check_first(self, used: set[int]) -> None:
         """ValueError where masks of a video are numbered from 1, as ffmpeg does, and not those of the frames in use."""
-        there = {int(path.stem) for path in self._paths if path.stem.isdecimal()}
+        there = {int(path.stem) for path in self.paths if path.stem.isdecimal()}
         if 1 in there and 0 not in there and there != used:
             raise ValueError(
                 f"masks.folder={self.folder} has masks from 1 on, and frames of a video are numbered from 0: call the "
@@ -147,7 +147,7 @@ class Masks:
         if self.folder is None:
             return []
         digest = hashlib.blake2b(digest_size=16)
-        for path in self._paths:
+        for path in self.paths:
             digest.update(path.name.encode() + reading.read_bytes(path))
         return [digest.hexdigest(), self.classes and [*self.classes], self.border]
 
@@ -190,10 +190,22 @@ def files_of(dataset: Dataset) -> tuple[list[Path | None], list[int]]:
     return (files if len({*files}) == len(files) else [None] * len(files)), numbers
 
 
+def check_names(dataset: Dataset, given: Collection[str], where: object) -> None:
+    """Raise ValueError if `given`, names of images without suffix in `where`, are those of each frame's neighbour."""
+    used = names_of(dataset)
+    check_numbering([stem(f"{name}.png") for name in getattr(dataset, "every", ())], used, given, where)
+    first, second = map(frame_name, (0, 1))
+    if files_of(dataset)[0][0] is None and first in used and first not in given and second in given:
+        raise ValueError(
+            f"{where} has names from {second} on, and frames of a video are numbered from {first}: call its first one "
+            f"{first} (ffmpeg: -start_number 0); if that is the video's second frame, dataset.start=1 says so"
+        )
+
+
 def image_names(files: Sequence[Path | None], numbers: Sequence[int]) -> list[str]:
     """Stems of the files if they are distinct, else the numbers."""
     stems = [stem(path.name) if path is not None else "" for path in files]
-    return stems if all(stems) and len({*stems}) == len(stems) else [f"{number:06d}" for number in numbers]
+    return stems if all(stems) and len({*stems}) == len(stems) else [*map(frame_name, numbers)]
 
 
 def stem(name: str) -> str:

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
-from emgs_jax.data.masks import MANY, Masks, files_of, masked
+from emgs_jax.data.masks import MANY, Masks, check_names, files_of, masked, stem
 from emgs_jax.data.reading import read_bytes
 from emgs_jax.data.spool import Spool
 
@@ -46,6 +46,7 @@ class ReadableFrames:
         self._spool, self._places = Spool(), {}  # frames without arrays, and the arrays' positions
         for name in ("name", "sequence", "size", "intrinsics", "calibration", "classes", "has_ground_truth"):
             setattr(self, name, getattr(dataset, name))
+        self.every = getattr(dataset, "every", ())
         self.full_intrinsics = getattr(dataset, "full_intrinsics", None)
         indices = range(len(dataset))
         self._masks, self._mask_files = masks, self._files_of_masks(dataset, masks)
@@ -107,7 +108,9 @@ class ReadableFrames:
             found = [own(index) for index in range(len(dataset))]
             return [path and (path, dataset.files(index)[0]) for index, path in enumerate(found)]
         images, numbers = files_of(dataset)
-        return [*zip(masks.files(images, numbers), images, strict=True)]
+        found = masks.files(images, numbers)
+        check_names(dataset, {stem(path.name) for path in masks.paths}, f"masks.folder={masks.folder}")
+        return [*zip(found, images, strict=True)]
 
     def _left_out(self, index: int, size: tuple[int, int]) -> np.ndarray | None:
         """What the mask of the data set's frame leaves out of its image in this (width, height)."""
