@@ -73,13 +73,13 @@ def is_file(path: Path) -> bool:
 
 
 def natural_key(path: Path) -> list[list[tuple[int, int, str]]]:
-    """Sort key that puts frame2 before frame10, and each folder together."""
+    """Sort key: frame2 before frame10, a before a(0), as a burst is named, and each folder together."""
 
     def key(name: str) -> list[tuple[int, int, str]]:
         parts = re.split(r"([0-9]+)", name.casefold())
         return [(1, int(p), p) if p and p[0] in "0123456789" else (0, 0, p) for p in parts]
 
-    return [key(name) for name in path.parts]
+    return [key(name) for name in (*path.parts[:-1], path.stem, path.suffix)]
 
 
 def natural_order(paths: Sequence[Path]) -> tuple[list[int], str | None]:
