@@ -55,7 +55,7 @@ def test_covariances_of_stretches_are_about_those_of_the_whole(walk, monkeypatch
     assert found.keys() == whole.keys() == images.keys()
     assert len(parts) > 1 and max(part.num_reg_images() for part in parts) <= most
     std = {frame: np.sqrt(np.diag(found[frame]) / np.diag(whole[frame])) for frame in images if frame}
-    assert 0.94 < min(one.min() for one in std.values())  # a stretch has its own unit
+    assert min(one.min() for one in std.values()) > 0.94  # a stretch has its own unit
     assert max(one.max() for one in std.values()) < (1.06 if most > 14 else 1.3)  # fewer images know less
     assert not found[0].any()
 
