@@ -28,7 +28,7 @@ from emgs_jax.mapping.run import MappingRun, new_run
 from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.page import write_report
-from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words
+from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words, why_no_errors
 from emgs_jax.runs.back_end import revisit_note
 from emgs_jax.runs.dense import center_cloud, dense_map
 from emgs_jax.runs.files import claim_folder, save_classes, save_outputs, save_progress
@@ -120,7 +120,10 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     if fitting is not None:
         tqdm.write("fitting splats to the images …")
         with clock.phase("polish"):
-            notes = [*notes, *polish_lines(polish(finished, dataset, fitting, densify))]
+            try:
+                notes = [*notes, *polish_lines(polish(finished, dataset, fitting, densify))]
+            except ValueError as error:  # the run itself is finished
+                notes = [*notes, f"not polished: {error}"]
     with _said(clock, "report", f"writing {REPORT_FILE}"):
         write_report(finished, dataset)
     if live is not None:
@@ -194,7 +197,7 @@ def main(config: DictConfig) -> float:
     """Run, print the results, and return the trajectory error (inf without one) for Hydra's sweepers."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     metrics = run(config, folder)
-    print(metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
+    print(metrics_table(metrics) if "trajectory/num_frames" in metrics else why_no_errors(metrics))
     for key, value in metrics.items():
         if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):
             print(f"{key} {value:.4g}")

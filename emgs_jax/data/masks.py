@@ -55,12 +55,13 @@ class Masks:
         found = sorted(Path(self.folder).expanduser().rglob("*"))
         return [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")]
 
-    def files(self, images: Sequence[Path | None], numbers: Sequence[int]) -> list[Path | None]:
+    def files(self, images: Sequence[Path | None], numbers: Sequence[int], may_lack: bool = False) -> list[Path | None]:
         """The mask of each image, by its name and, where names repeat, its folders; None without a `folder`.
 
         Args:
             images: file of each; None for a frame of a video, whose mask is named by its number.
             numbers: of each, from 0.
+            may_lack: an image without a mask gets None.
 
         Raises:
             ValueError: an image has no mask, or two images have the same.
@@ -80,7 +81,7 @@ class Masks:
                 ends = [(*above[row:], name) for row in range(len(above) + 1) for name in (image.stem, image.name)]
             found.append(next((by_end[end][0] for end in ends if len(by_end.get(end, ())) == 1), None))
         missing = [row for row, path in enumerate(found) if path is None]
-        if missing:
+        if missing and not may_lack:
             image = images[missing[0]]
             name = frame_name(numbers[missing[0]]) if image is None else image.stem
             raise ValueError(
@@ -89,7 +90,7 @@ class Masks:
             )
         if None in images:
             self._check_first(set(numbers))
-        path, count = Counter(found).most_common(1)[0]
+        path, count = Counter(filter(None, found)).most_common(1)[0]
         if count > 1 and None not in images:
             raise ValueError(f"{path} is the mask of {count} images: put masks into folders with the names of theirs")
         return found

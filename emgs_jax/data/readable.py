@@ -49,14 +49,17 @@ class ReadableFrames:
         self.every = getattr(dataset, "every", ())
         self.full_intrinsics = getattr(dataset, "full_intrinsics", None)
         indices = range(len(dataset))
-        self._masks, self._mask_files = masks, self._files_of_masks(dataset, masks)
+        may_skip = on_bad_frame == "skip"
+        self._masks, self._mask_files = masks, self._files_of_masks(dataset, masks, may_skip)
         self.has_masks = any(self._mask_files)
-        self.skipped = _unreadable(self._read, progress(indices)) if on_bad_frame == "skip" else {}
+        self.skipped = _unreadable(self._read, progress(indices)) if may_skip else {}
         self.kept = tuple(index for index in indices if index not in self.skipped)
         if not self.kept:
             what = f"{dataset.name} {dataset.sequence}"
             first = next(iter(self.skipped.values()), "there are none")
             raise ValueError(f"{what} has no frame that can be read: {first}")
+        if may_skip and masks.folder is not None:
+            masks.files(*([every[index] for index in self.kept] for every in files_of(dataset)))
         _check_truth(dataset, self.kept)
         self.mask_note = self._mask_note() if self.has_masks else None
 
@@ -101,16 +104,16 @@ class ReadableFrames:
         return note if share <= MANY else f"{note}; {advice}"
 
     @staticmethod
-    def _files_of_masks(dataset: Dataset, masks: Masks) -> list[tuple[Path, Path | None] | None]:
+    def _files_of_masks(dataset: Dataset, masks: Masks, may_lack: bool) -> list[tuple[Path, Path | None] | None]:
         """The mask and the image file of each frame of the data set; None where it has no mask."""
         if masks.folder is None:
             own = getattr(dataset, "mask_file", lambda _: None)
             found = [own(index) for index in range(len(dataset))]
             return [path and (path, dataset.files(index)[0]) for index, path in enumerate(found)]
         images, numbers = files_of(dataset)
-        found = masks.files(images, numbers)
+        found = masks.files(images, numbers, may_lack)
         check_names(dataset, {stem(path.name) for path in masks.paths}, f"masks.folder={masks.folder}")
-        return [*zip(found, images, strict=True)]
+        return [path and (path, image) for path, image in zip(found, images, strict=True)]
 
     def _left_out(self, index: int, size: tuple[int, int]) -> np.ndarray | None:
         """What the mask of the data set's frame leaves out of its image in this (width, height)."""

@@ -155,12 +155,17 @@ def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
     Poses of lost frames are guesses, and those of submaps that were never joined are in a world of their own.
     """
-    rows = zip(poses, run.true_poses, run.records, strict=True)
-    pairs = [(pose, true) for pose, true, record in rows if true is not None and record.status not in UNPLACED]
-    if not pairs:
+    rows = rows_with_truth(run)
+    if not len(rows):
         return None
-    estimate, truth = zip(*pairs, strict=True)
-    return np.stack(estimate), np.stack(truth).astype(np.float64)
+    estimate, truth = (np.stack([path[row] for row in rows]) for path in (poses, run.true_poses))
+    return estimate, truth.astype(np.float64)
+
+
+def rows_with_truth(run: MappingRun) -> np.ndarray:
+    """Return the rows of the records of placed frames whose truth is known; those of `with_truth`."""
+    rows = zip(run.true_poses, run.records, strict=True)
+    return np.flatnonzero([true is not None and record.status not in UNPLACED for true, record in rows])
 
 
 def placed_percent(run: MappingRun) -> float:

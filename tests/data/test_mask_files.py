@@ -194,6 +194,18 @@ def test_masks_that_are_those_of_other_frames_are_refused(tmp_path):
         ReadableFrames(both, masks=Masks(str(flat)))
 
 
+def test_an_image_that_cannot_be_read_needs_no_mask_where_it_is_skipped(tmp_path):
+    """Symptom: `on_bad_frame=skip` ended for want of the mask of an image that it skips."""
+    data = photos(tmp_path / "data", tmp_path / "masks")
+    (tmp_path / "data/IMG 3.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    (tmp_path / "masks/IMG 3.png").unlink()
+    frames = ReadableFrames(data, "skip", masks=Masks(str(tmp_path / "masks"), border=0))
+    assert [*frames.skipped] == [3] and len(frames) == COUNT - 1 and max(map(wrong, frames)) < 0.02
+    (tmp_path / "masks/IMG 5.png").unlink()
+    with pytest.raises(ValueError, match="has no mask for IMG 5 .and 0 more."):
+        ReadableFrames(data, "skip", masks=Masks(str(tmp_path / "masks")))
+
+
 def test_masks_that_leave_out_most_are_said(tmp_path):
     data = photos(tmp_path / "data", tmp_path / "masks")
     assert (
