@@ -24,7 +24,7 @@ from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.mapping.convert import to_camera
 from emgs_jax.mapping.pipeline import finish_run, map_frames
 from emgs_jax.mapping.records import FrameRecord, show_records, to_line
-from emgs_jax.mapping.run import MappingRun, new_run
+from emgs_jax.mapping.run import MappingRun, check_settings, new_run
 from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.page import write_report
@@ -68,6 +68,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         clock = stack.enter_context(Clock().watching())
         with clock.phase("setup"):
             slam, evaluation, densify = (build(config, name) for name in ("slam", "evaluation", "densify"))
+            check_settings(slam)  # before COLMAP works for minutes
             graph, fused = graph_config(config), baseline_configs(config)
             dataset = build_dataset(config, folder)
             prior = build_prior(config, dataset)

@@ -18,7 +18,7 @@ from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_numbering, frame_name
 from emgs_jax.data.labels import LabelFolder
 from emgs_jax.ops.ranges import ranged
 
-MAX_STRETCH = 0.02  # relative difference in aspect of a mask and its image
+MAX_STRETCH = 0.02  # of a mask and its image: networks round sides to whole patches
 JPEG_BLACK = 16  # of 255: compression spreads black into its surroundings and back
 MANY = 0.5  # share of an image
 
@@ -118,9 +118,9 @@ class Masks:
             is_out = values <= (JPEG_BLACK if path.suffix.lower() in (".jpg", ".jpeg") else 0)
         else:
             is_out = np.isin(self._labels.read(path), [self._labels.names.index(one) for one in self.classes])
-        if not _is_alike(is_out, size) and image is not None:
+        if reading.stretch(is_out.shape[::-1], size) > MAX_STRETCH and image is not None:
             is_out = _turned(is_out, reading.orientation(image))
-        if not _is_alike(is_out, size) or is_out.shape[1] < 16:
+        if reading.stretch(is_out.shape[::-1], size) > MAX_STRETCH or is_out.shape[1] < 16:
             (height, width), turned = is_out.shape, "; it is turned" if is_out.shape == tuple(size) else ""
             raise BadFrameError(
                 f"{path} is {width}x{height}, but its image is {size[0]}x{size[1]}{turned}: make it of that size"
@@ -156,12 +156,6 @@ class Masks:
 def resized(is_out: Bool[np.ndarray, "_ _"], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """A mask in (width, height) `size`; a pixel that covers some of what is left out is left out."""
     return cv2.resize(np.uint8(255 * is_out), size, interpolation=cv2.INTER_AREA) > 0
-
-
-def _is_alike(is_out: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> bool:
-    """Test whether a mask has the sides' ratio of an image."""
-    height, width = is_out.shape
-    return abs(width * size[1] / (height * size[0]) - 1.0) <= MAX_STRETCH
 
 
 def _turned(values: np.ndarray, orientation: int) -> np.ndarray:

@@ -13,13 +13,14 @@ from tqdm import tqdm
 
 from emgs_jax.data.colmap_model import check_whole, is_model, load_colmap
 from emgs_jax.data.masks import stem
+from emgs_jax.data.reading import stretch
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.library import load
 from emgs_jax.structure.reconstruct import DATABASE, Shots, map_database
 
 PARTS = ("cameras", "images")
 SAME_FOCAL = 0.01  # relative difference up to which cameras are one: less than what it costs to map as another
-MAX_STRETCH = 0.01  # relative difference of the sides' ratio, of a model's images and these
+MAX_STRETCH = 0.01  # of a model's images and these: sides are whole pixels
 SQLITE = b"SQLite format 3\0"  # how its files begin
 
 
@@ -148,7 +149,7 @@ def resize(model: Any, shots: Shots, key: str) -> None:
 
 def check_shape(found: tuple[int, int], size: tuple[int, int], key: str) -> None:
     """ValueError where images of `found` (width, height) are no copies of those of `size`."""
-    if abs(found[0] * size[1] / (found[1] * size[0]) - 1) > MAX_STRETCH:
+    if stretch(found, size) > MAX_STRETCH:
         raise ValueError(
             f"{key} is of images of {found[0]}x{found[1]}, which are no copies of those of {size[0]}x{size[1]}: give "
             "the images that the model was made of"
