@@ -160,12 +160,13 @@ def test_a_map_that_begins_without_a_gaussian_names_the_frame_and_the_points(mon
     """A map without a Gaussian was said to be of a prior without a point."""
     monkeypatch.setattr(pipeline, "prepare_step", lambda *_: None)  # of a step, which there is not
 
-    def with_three(prediction):
-        few = np.arange(prediction.mask[0].size).reshape(prediction.mask[0].shape) < 3
+    def with_few(prediction):
+        few = np.zeros(prediction.mask.shape[1:], bool)
+        few[[20, 20, 21], [20, 21, 20]] = True  # a Gaussian takes four
         return replace(prediction, mask=prediction.mask & few)
 
     with pytest.raises(ValueError, match=r"of 3 valid points none become a Gaussian; begin elsewhere"):
-        map_tiny(dataset(), EditedPrior(with_three))
+        map_tiny(dataset(), EditedPrior(with_few))
 
 
 def test_a_sequence_without_frames_is_refused():
