@@ -10,7 +10,7 @@ from tqdm import tqdm
 
 from emgs_jax.back_end.saved_map import load_saved_map
 from emgs_jax.back_end.state import BackEndConfig
-from emgs_jax.config.configure import build, build_dataset, build_prior, compose, graph_config, message_of
+from emgs_jax.config.configure import build, build_dataset, build_prior, check_added, compose, graph_config, message_of
 from emgs_jax.device.clock import Clock
 from emgs_jax.device.settings import use_compilation_cache
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
@@ -48,6 +48,7 @@ def load_config(*overrides: str, name: str = "config") -> RunConfig:
         ValueError: an override names no key or option; the message suggests similar ones.
     """
     config = compose(*overrides, name=name)
+    check_added(overrides, name)
     try:
         slam, densify, evaluation = (build(config, part) for part in ("slam", "densify", "evaluation"))
         graph = graph_config(config)

@@ -22,7 +22,7 @@ from hydra.types import RunMode
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
-from emgs_jax.config.configure import CONF, compose, first_of_sweep, message_of
+from emgs_jax.config.configure import CONF, check_added, compose, first_of_sweep, message_of
 from emgs_jax.config.overrides import KEY, quoted, readable
 from emgs_jax.config.values import check_keys
 from emgs_jax.device.settings import check_platforms, leave_memory_to_torch, use_compilation_cache
@@ -176,6 +176,7 @@ def check_arguments(name: str, arguments: list[str]) -> None:
     if folder is not None and not any(o.key_or_group == "hydra.searchpath" for o in own):
         overrides.append(f"hydra.searchpath=[{quoted(f'file://{Path(folder).resolve()}')}]")
     compose(*overrides, name=name)
+    check_added(overrides, name)
 
 
 def name_of(name: str) -> str:

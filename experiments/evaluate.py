@@ -19,7 +19,7 @@ from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
-from emgs_jax.config.configure import compose, message_of
+from emgs_jax.config.configure import check_added, compose, message_of
 from emgs_jax.config.overrides import quoted, written
 from emgs_jax.config.values import check_values
 from emgs_jax.io.files import check_writable, write_file, write_json
@@ -56,6 +56,7 @@ def plan(settings: Mapping[str, Any]) -> Iterator[Job]:
             _check_free([*settings["overrides"], *changed], dataset, data.get("key", SEQUENCE))
             overrides = [f"dataset={dataset}", *own, *settings["overrides"], *changed]
             common = compose(*overrides)
+            check_added(overrides)
             has_seed = "seed" in common.prior
             if not has_seed and len(settings["seeds"]) > 1:
                 raise ValueError(f"prior.seed is no key of {common.prior._target_}: give one seed, seeds=[0]")

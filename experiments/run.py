@@ -25,11 +25,11 @@ from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.mapping.convert import to_camera
 from emgs_jax.mapping.pipeline import finish_run, map_frames
 from emgs_jax.mapping.records import FrameRecord, show_records, to_line
-from emgs_jax.mapping.run import MappingRun, new_run
+from emgs_jax.mapping.run import MappingRun, check_settings, new_run
 from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import Prior
 from emgs_jax.report.page import write_report
-from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words
+from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words, why_no_errors
 from emgs_jax.runs.back_end import revisit_note
 from emgs_jax.runs.dense import center_cloud, dense_map
 from emgs_jax.runs.files import claim_folder, save_classes, save_outputs, save_progress
@@ -72,6 +72,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         clock = stack.enter_context(Clock().watching())
         with clock.phase("setup"):
             slam, evaluation, densify = (build(config, name) for name in ("slam", "evaluation", "densify"))
+            check_settings(slam)  # before COLMAP works for minutes
             graph, fused = graph_config(config), baseline_configs(config)
             dataset = build_dataset(config, folder)
             prior = build_prior(config, dataset)
@@ -137,7 +138,10 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     if fitting is not None:
         tqdm.write("fitting splats to the images …")
         with clock.phase("polish"):
-            notes = [*notes, *polish_lines(polish(finished, dataset, fitting, densify))]
+            try:
+                notes = [*notes, *polish_lines(polish(finished, dataset, fitting, densify))]
+            except ValueError as error:  # the run itself is finished
+                notes = [*notes, f"not polished: {error}"]
     with _said(clock, "report", f"writing {REPORT_FILE}"):
         write_report(finished, dataset)
     if isinstance(live, LiveView):
@@ -210,7 +214,7 @@ def run_and_print(config: DictConfig) -> float:
     """Run, print the results, and return the trajectory error (inf without one)."""
     folder = Path(HydraConfig.get().runtime.output_dir)
     metrics = run(config, folder)
-    print(metrics_table(metrics) if "trajectory/num_frames" in metrics else "no ground truth, so no errors")
+    print(metrics_table(metrics) if "trajectory/num_frames" in metrics else why_no_errors(metrics))
     for key, value in metrics.items():
         if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):
             print(f"{key} {value:.4g}")

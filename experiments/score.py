@@ -37,10 +37,10 @@ def score(config: DictConfig) -> tuple[Metrics, Path]:
     folder = result_folder(Path(config.out), dataset.name, dataset.sequence, config.method, 0)
     is_finished(folder, settings)  # raises if another result is there
     cloud = None if config.points is None else read_cloud(config.points, config.normal_neighbours)
-    poses, truth, counts = matched_poses(
+    poses, truth, frames, counts = matched_poses(
         config.trajectory, dataset, config.max_time_difference, config.min_associated_percent
     )
-    metrics = trajectory_metrics(poses, truth) | counts
+    metrics = trajectory_metrics(poses, truth, frames) | counts
     if cloud is not None:
         metrics |= compare_clouds(cloud, true_cloud(dataset, evaluation), (poses, truth), evaluation)
     block = provenance(settings, dataset, Provenance(config.method, {}, config.simulated))
@@ -52,8 +52,12 @@ def score(config: DictConfig) -> tuple[Metrics, Path]:
 
 def matched_poses(
     path: str, dataset: ReadableFrames, max_difference: float, min_percent: float
-) -> tuple[np.ndarray, np.ndarray, dict[str, int]]:
-    """Poses of a file and true poses of the same times (n, 4, 4), and the number of each; ValueError if few match."""
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, dict[str, int]]:
+    """Poses of a file, true poses of the same times (n, 4, 4), numbers of their frames (n,), and how many each has.
+
+    Raises:
+        ValueError: few match.
+    """
     if not Path(path).is_file():
         raise FileNotFoundError(f"trajectory={path} is no file: give a file with `timestamp tx ty tz qx qy qz qw`")
     times, poses = load_trajectory_tum(path)
@@ -62,10 +66,12 @@ def matched_poses(
     times, poses = in_seconds(times[order]), poses[order]
     what = f"{dataset.name} {dataset.sequence}"
     frames = (dataset[row] for row in range(len(dataset)))
-    known = [(frame.timestamp, frame.T_world_camera) for frame in frames if frame.T_world_camera is not None]
+    known = [
+        (frame.timestamp, frame.T_world_camera, frame.index) for frame in frames if frame.T_world_camera is not None
+    ]
     if not known:
         raise ValueError(f"{what} has no true poses to compare with: choose another data set")
-    true_times = np.array([time for time, _ in known])
+    true_times = np.array([time for time, *_ in known])
     rows, true_rows = associate(times, true_times, max_difference)
     spans = f"Its timestamps are {_span(times)}, those of {what} {_span(true_times)}"
     if len(rows) < max(1, 0.01 * min_percent * min(len(times), len(known))):
@@ -80,7 +86,8 @@ def matched_poses(
     _check_twice(times, poses, path)
     check_conventions(poses[rows], truth, path)
     counts = {"score/num_poses": len(times), "score/num_frames": len(known)}
-    return poses[rows], truth, counts | {PLACED_PERCENT: 100.0 * len(rows) / len(known)}
+    numbers = np.array([known[row][2] for row in true_rows])
+    return poses[rows], truth, numbers, counts | {PLACED_PERCENT: 100.0 * len(rows) / len(known)}
 
 
 def _check_twice(times: np.ndarray, poses: np.ndarray, path: str) -> None:

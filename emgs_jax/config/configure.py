@@ -2,6 +2,7 @@
 
 import copy
 import difflib
+import inspect
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -15,14 +16,14 @@ from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.core.singleton import Singleton
 from hydra.errors import ConfigCompositionException, HydraException, InstantiationException, MissingConfigException
-from hydra.utils import instantiate
+from hydra.utils import get_class, instantiate
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import MissingMandatoryValue
 from tqdm import tqdm
 
 from emgs_jax.config.overrides import readable
 from emgs_jax.config.schema import register
-from emgs_jax.config.values import check_values
+from emgs_jax.config.values import check_values, declared
 from emgs_jax.data.masks import Masks
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.prior.base import Prior
@@ -55,6 +56,7 @@ RENAMED = {  # keys of earlier versions; the longest match counts
     "prior.structure.masks": "masks.folder",
     "prior.dense.depth.depth_step": "prior.dense.depth_step",
 }
+OPEN = ("baseline", "variants", "tolerances", "suite")  # nodes that take any name
 NO_WORD = (ValueError, TypeError, AssertionError)  # raised by Hydra if an option of a group is no word
 
 
@@ -95,6 +97,36 @@ def compose(*overrides: str, name: str = "config") -> DictConfig:
                 f"({', '.join(options)}) with {group}={value if value in options else options[0]}"
             )
     return config
+
+
+def check_added(overrides: Sequence[str], name: str = "config") -> None:
+    """Raise ValueError, with near names, if an override with + adds a key to conf/`name`.yaml that nobody reads."""
+    parsed = OverridesParser.create().parse_overrides(readable(overrides))
+    added = [override for override in parsed if override.is_add() or override.is_force_add()]
+    if not added:
+        return
+    config = compose(*(override.input_line for override in parsed if override not in added), name=name)
+    known = keys_of(config)
+    for override in added:
+        key = override.key_or_group
+        parents = [key.rsplit(".", count)[0] for count in range(1, key.count(".") + 1)]
+        parent = next((one for one in parents if one in known), "")
+        if key in {*known, *groups()} or key.partition(".")[0] in ("hydra", *OPEN) or _is_read(config, parent, key):
+            continue
+        raise ValueError(
+            f"{override.input_line} would have no effect: {key} is no key of the config; {near(key, sorted(known))}"
+        )
+
+
+def _is_read(config: DictConfig, parent: str, key: str) -> bool:
+    """Test whether a class takes what is added below a node: one of its parameters, or any key of a dict of its."""
+    above = [parent, *(parent.rsplit(".", count)[0] for count in range(1, parent.count(".") + 1))] if parent else []
+    made = next((one for one in above if "_target_" in (OmegaConf.select(config, one) or ())), None)
+    if made is None:
+        return False
+    target = get_class(OmegaConf.select(config, made)["_target_"])
+    takes_any = any(one.kind is one.VAR_KEYWORD for one in inspect.signature(target).parameters.values())
+    return takes_any or made != parent or key.removeprefix(f"{made}.") in declared(target)
 
 
 @contextmanager
@@ -191,8 +223,8 @@ def near(key: str, known: Sequence[str]) -> str:
     found = [name for name in known if ends[name] == last] + difflib.get_close_matches(key, siblings, 5)
     found += [name for end in similar for name in siblings if ends[name] == end] or siblings[:5]
     found += difflib.get_close_matches(key, known, 5) + [name for name in known if ends[name] in similar]
-    found = list(dict.fromkeys(found))[:5]
-    return f"near names: {', '.join(found)}" if found else f"the keys are {', '.join(known)}"
+    found = list(dict.fromkeys(found))[:5] or difflib.get_close_matches(key, known, 5, 0)
+    return f"near names: {', '.join(found)}"
 
 
 def build_dataset(config: DictConfig, folder: Path | None = None) -> ReadableFrames:

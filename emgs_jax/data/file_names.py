@@ -3,7 +3,8 @@
 import itertools
 import math
 import re
-from collections.abc import Sequence
+from collections import defaultdict
+from collections.abc import Collection, Sequence
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -33,6 +34,11 @@ def find_image(folder: Path, name: str) -> Path:
             if is_file(path := folder / f"{written}{ending}"):
                 return path
     return folder / name.replace("\\", "/")
+
+
+def frame_name(number: int) -> str:
+    """The name of a frame that has no file of its own, as in a video."""
+    return f"{number:06d}"
 
 
 def check_one_kind(paths: Sequence[Path]) -> None:
@@ -67,13 +73,13 @@ def is_file(path: Path) -> bool:
 
 
 def natural_key(path: Path) -> list[list[tuple[int, int, str]]]:
-    """Sort key that puts frame2 before frame10, and each folder together."""
+    """Sort key: frame2 before frame10, a before a(0), as a burst is named, and each folder together."""
 
     def key(name: str) -> list[tuple[int, int, str]]:
         parts = re.split(r"([0-9]+)", name.casefold())
         return [(1, int(p), p) if p and p[0] in "0123456789" else (0, 0, p) for p in parts]
 
-    return [key(name) for name in path.parts]
+    return [key(name) for name in (*path.parts[:-1], path.stem, path.suffix)]
 
 
 def natural_order(paths: Sequence[Path]) -> tuple[list[int], str | None]:
@@ -152,6 +158,42 @@ def last_number(name: str) -> int | float | None:
     if not found:
         return None
     return float(found[-1]) if "." in found[-1] or len(found[-1]) > 300 else int(found[-1])
+
+
+def check_numbering(every: Collection[str], used: Collection[str], given: Collection[str], where: object) -> None:
+    """Raise ValueError if names are those of images but for the first number, such as 0 and ffmpeg's 1.
+
+    Each would be taken for its neighbour's. They are if all are one off, and one of them is of no image; or if they are
+    those of the images in use, one off.
+
+    Args:
+        every: names of all images, without suffix; empty if not known.
+        used: names of the images in use.
+        given: names of masks, poses or predictions, in `where`.
+    """
+    others = _numbers(given)
+    for names, is_all in ((every, False), (used, True)):
+        for kind, numbers in _numbers(names).items():
+            found = others.get(kind, {})
+            off = (found.keys() - {number + step for number in numbers} for step in (1, -1))
+            if not numbers.keys() & found.keys() or all(off) or (is_all and len(found) < len(numbers)):
+                continue
+            low, high = min(numbers), max(numbers)
+            if {low - 1, high + 1} & found.keys():
+                raise ValueError(
+                    f"{where} has names from {found[min(found)].join(kind)} on, the images from "
+                    f"{numbers[low].join(kind)} on, so each would be its neighbour's: rename one of them, so that both "
+                    "begin alike (ffmpeg: -start_number 0)"
+                )
+
+
+def _numbers(names: Collection[str]) -> dict[tuple[str, str], dict[int, str]]:
+    """The numbers in names, and how they are written, by what stands before and after."""
+    found = defaultdict(dict)
+    for name in names:
+        for match in re.finditer("[0-9]{1,18}", name):
+            found[name[: match.start()], name[match.end() :]][int(match[0])] = match[0]
+    return found
 
 
 def _back_note(paths: Sequence[Path], times: Sequence[float | None]) -> str | None:

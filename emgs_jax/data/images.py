@@ -8,7 +8,15 @@ import numpy as np
 from jaxtyping import UInt8
 
 from emgs_jax.data import reading
-from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_one_kind, natural_order, taken_note, times_of, unread_note
+from emgs_jax.data.file_names import (
+    IMAGE_SUFFIXES,
+    check_one_kind,
+    frame_name,
+    natural_order,
+    taken_note,
+    times_of,
+    unread_note,
+)
 from emgs_jax.data.intrinsics import ALTERNATIVES, Given, Pictures, find_lens
 from emgs_jax.data.straightened import Straightened
 from emgs_jax.data.tones import read_shown, tones_of
@@ -44,6 +52,9 @@ class Images(Straightened):
         else:
             self._folder, (paths, times, notes) = path, listed(path)
         self._select(len(paths), f"{path} ({LAYOUT})")
+        self.every = (
+            [frame_name(row) for row in range(self._video.count)] if self._video else [one.stem for one in paths]
+        )
         self._images, self._times = ([every[row] for row in self._chosen] for every in (paths, times))
         if self._video is None:
             self._tones = tones_of(self._images)

@@ -3,7 +3,7 @@
 import hashlib
 import re
 from collections import Counter, defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -14,11 +14,11 @@ from jaxtyping import Bool
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
-from emgs_jax.data.file_names import IMAGE_SUFFIXES
+from emgs_jax.data.file_names import IMAGE_SUFFIXES, check_numbering, frame_name
 from emgs_jax.data.labels import LabelFolder
 from emgs_jax.ops.ranges import ranged
 
-MAX_STRETCH = 0.02  # relative difference in aspect of a mask and its image
+MAX_STRETCH = 0.02  # of a mask and its image: networks round sides to whole patches
 JPEG_BLACK = 16  # of 255: compression spreads black into its surroundings and back
 MANY = 0.5  # share of an image
 
@@ -50,17 +50,18 @@ class Masks:
         return LabelFolder(Path(self.folder).expanduser(), Path(self.names).expanduser(), None)
 
     @cached_property
-    def _paths(self) -> list[Path]:
+    def paths(self) -> list[Path]:
         """All images in the folder and below."""
         found = sorted(Path(self.folder).expanduser().rglob("*"))
         return [path for path in found if path.suffix.lower() in IMAGE_SUFFIXES and not path.name.startswith(".")]
 
-    def files(self, images: Sequence[Path | None], numbers: Sequence[int]) -> list[Path | None]:
+    def files(self, images: Sequence[Path | None], numbers: Sequence[int], may_lack: bool = False) -> list[Path | None]:
         """The mask of each image, by its name and, where names repeat, its folders; None without a `folder`.
 
         Args:
             images: file of each; None for a frame of a video, whose mask is named by its number.
             numbers: of each, from 0.
+            may_lack: an image without a mask gets None.
 
         Raises:
             ValueError: an image has no mask, or two images have the same.
@@ -68,35 +69,35 @@ class Masks:
         if self.folder is None:
             return [None] * len(images)
         by_end, found = defaultdict(list), []
-        for path in self._paths:
+        for path in self.paths:
             parts = path.relative_to(Path(self.folder).expanduser()).parts
             for begin in range(len(parts)):
                 by_end[(*parts[begin:-1], path.stem)].append(path)
         for image, number in zip(images, numbers, strict=True):
             if image is None:
-                ends = [(f"{number:06d}",)]
+                ends = [(frame_name(number),)]
             else:  # the longest path that a mask ends with; COLMAP's are called NAME.png.png
                 above = image.parts[:-1]
                 ends = [(*above[row:], name) for row in range(len(above) + 1) for name in (image.stem, image.name)]
             found.append(next((by_end[end][0] for end in ends if len(by_end.get(end, ())) == 1), None))
         missing = [row for row, path in enumerate(found) if path is None]
-        if missing:
+        if missing and not may_lack:
             image = images[missing[0]]
-            name = f"{numbers[missing[0]]:06d}" if image is None else image.stem
+            name = frame_name(numbers[missing[0]]) if image is None else image.stem
             raise ValueError(
                 f"masks.folder={self.folder} has no mask for {name} (and {len(missing) - 1} more): give a "
                 f"folder with one image for each frame, {name}.png"
             )
         if None in images:
             self._check_first(set(numbers))
-        path, count = Counter(found).most_common(1)[0]
+        path, count = Counter(filter(None, found)).most_common(1)[0]
         if count > 1 and None not in images:
             raise ValueError(f"{path} is the mask of {count} images: put masks into folders with the names of theirs")
         return found
 
     def _check_first(self, used: set[int]) -> None:
         """ValueError where masks of a video are numbered from 1, as ffmpeg does, and not those of the frames in use."""
-        there = {int(path.stem) for path in self._paths if path.stem.isdecimal()}
+        there = {int(path.stem) for path in self.paths if path.stem.isdecimal()}
         if 1 in there and 0 not in there and there != used:
             raise ValueError(
                 f"masks.folder={self.folder} has masks from 1 on, and frames of a video are numbered from 0: call the "
@@ -117,9 +118,9 @@ class Masks:
             is_out = values <= (JPEG_BLACK if path.suffix.lower() in (".jpg", ".jpeg") else 0)
         else:
             is_out = np.isin(self._labels.read(path), [self._labels.names.index(one) for one in self.classes])
-        if not _is_alike(is_out, size) and image is not None:
+        if reading.stretch(is_out.shape[::-1], size) > MAX_STRETCH and image is not None:
             is_out = _turned(is_out, reading.orientation(image))
-        if not _is_alike(is_out, size) or is_out.shape[1] < 16:
+        if reading.stretch(is_out.shape[::-1], size) > MAX_STRETCH or is_out.shape[1] < 16:
             (height, width), turned = is_out.shape, "; it is turned" if is_out.shape == tuple(size) else ""
             raise BadFrameError(
                 f"{path} is {width}x{height}, but its image is {size[0]}x{size[1]}{turned}: make it of that size"
@@ -147,7 +148,7 @@ class Masks:
         if self.folder is None:
             return []
         digest = hashlib.blake2b(digest_size=16)
-        for path in self._paths:
+        for path in self.paths:
             digest.update(path.name.encode() + reading.read_bytes(path))
         return [digest.hexdigest(), self.classes and [*self.classes], self.border]
 
@@ -155,12 +156,6 @@ class Masks:
 def resized(is_out: Bool[np.ndarray, "_ _"], size: tuple[int, int]) -> Bool[np.ndarray, "h w"]:
     """A mask in (width, height) `size`; a pixel that covers some of what is left out is left out."""
     return cv2.resize(np.uint8(255 * is_out), size, interpolation=cv2.INTER_AREA) > 0
-
-
-def _is_alike(is_out: Bool[np.ndarray, "h w"], size: tuple[int, int]) -> bool:
-    """Test whether a mask has the sides' ratio of an image."""
-    height, width = is_out.shape
-    return abs(width * size[1] / (height * size[0]) - 1.0) <= MAX_STRETCH
 
 
 def _turned(values: np.ndarray, orientation: int) -> np.ndarray:
@@ -190,10 +185,22 @@ def files_of(dataset: Dataset) -> tuple[list[Path | None], list[int]]:
     return (files if len({*files}) == len(files) else [None] * len(files)), numbers
 
 
+def check_names(dataset: Dataset, given: Collection[str], where: object) -> None:
+    """Raise ValueError if `given`, names of images without suffix in `where`, are those of each frame's neighbour."""
+    used = names_of(dataset)
+    check_numbering([stem(f"{name}.png") for name in getattr(dataset, "every", ())], used, given, where)
+    first, second = map(frame_name, (0, 1))
+    if files_of(dataset)[0][0] is None and first in used and first not in given and second in given:
+        raise ValueError(
+            f"{where} has names from {second} on, and frames of a video are numbered from {first}: call its first one "
+            f"{first} (ffmpeg: -start_number 0); if that is the video's second frame, dataset.start=1 says so"
+        )
+
+
 def image_names(files: Sequence[Path | None], numbers: Sequence[int]) -> list[str]:
     """Stems of the files if they are distinct, else the numbers."""
     stems = [stem(path.name) if path is not None else "" for path in files]
-    return stems if all(stems) and len({*stems}) == len(stems) else [f"{number:06d}" for number in numbers]
+    return stems if all(stems) and len({*stems}) == len(stems) else [*map(frame_name, numbers)]
 
 
 def stem(name: str) -> str:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
-from emgs_jax.data.masks import MANY, Masks, files_of, masked
+from emgs_jax.data.masks import MANY, Masks, check_names, files_of, masked, stem
 from emgs_jax.data.reading import read_bytes
 from emgs_jax.data.spool import Spool
 
@@ -47,16 +47,20 @@ class ReadableFrames:
         self._spool, self._places = Spool(), {}  # frames without arrays, and the arrays' positions
         for name in ("name", "sequence", "size", "intrinsics", "calibration", "classes", "has_ground_truth"):
             setattr(self, name, getattr(dataset, name))
+        self.every = getattr(dataset, "every", ())
         self.full_intrinsics = getattr(dataset, "full_intrinsics", None)
         self._grows, indices = dataset.total is None, range(len(dataset))
-        self._masks, self._mask_files = masks, self._files_of_masks(dataset, masks)
+        may_skip = on_bad_frame == "skip"
+        self._masks, self._mask_files = masks, self._files_of_masks(dataset, masks, may_skip)
         self.has_masks = any(self._mask_files)
-        self.skipped = _unreadable(self._read, progress(indices)) if on_bad_frame == "skip" else {}
+        self.skipped = _unreadable(self._read, progress(indices)) if may_skip else {}
         self.kept = [index for index in indices if index not in self.skipped]
         if not self.kept:
             what = f"{dataset.name} {dataset.sequence}"
             first = next(iter(self.skipped.values()), "there are none")
             raise ValueError(f"{what} has no frame that can be read: {first}")
+        if may_skip and masks.folder is not None:
+            masks.files(*([every[index] for index in self.kept] for every in files_of(dataset)))
         _check_truth(dataset, self.kept)
         self.mask_note = self._mask_note() if self.has_masks else None
 
@@ -132,14 +136,16 @@ class ReadableFrames:
         return note if share <= MANY else f"{note}; {advice}"
 
     @staticmethod
-    def _files_of_masks(dataset: Dataset, masks: Masks) -> list[tuple[Path, Path | None] | None]:
+    def _files_of_masks(dataset: Dataset, masks: Masks, may_lack: bool) -> list[tuple[Path, Path | None] | None]:
         """The mask and the image file of each frame of the data set; None where it has no mask."""
         if masks.folder is None:
             own = getattr(dataset, "mask_file", lambda _: None)
             found = [own(index) for index in range(len(dataset))]
             return [path and (path, dataset.files(index)[0]) for index, path in enumerate(found)]
         images, numbers = files_of(dataset)
-        return [*zip(masks.files(images, numbers), images, strict=True)]
+        found = masks.files(images, numbers, may_lack)
+        check_names(dataset, {stem(path.name) for path in masks.paths}, f"masks.folder={masks.folder}")
+        return [path and (path, image) for path, image in zip(found, images, strict=True)]
 
     def _left_out(self, index: int, size: tuple[int, int]) -> np.ndarray | None:
         """What the mask of the data set's frame leaves out of its image in this (width, height)."""

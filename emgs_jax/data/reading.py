@@ -69,6 +69,11 @@ def limit(start: int, stop: int | None) -> int | None:
     return stop if isinstance(start, int) and isinstance(stop, int) and 0 <= start < stop else None
 
 
+def stretch(size: Size, other: Size) -> float:
+    """Relative difference of the sides' ratios of two images: 0 if one is a smaller copy of the other."""
+    return abs(size[0] * other[1] / (size[1] * other[0]) - 1.0)
+
+
 def check_index(index: int, count: int) -> None:
     """Raise IndexError outside of 0..count-1, which ends a for loop over a data set."""
     if not 0 <= index < count:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +14,8 @@ from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.intrinsics import Lens, with_notes
 from emgs_jax.data.reading import Size
 from emgs_jax.data.tones import read_shown
+
+NUM_LENSES = 8  # whose tables are kept: an image, its depth and its mask have the same
 
 
 @dataclass(eq=False)
@@ -51,6 +54,7 @@ class Straightened(Dataset):
     def _use(self, lens: Lens, raw_size: Size, *notes: str | None) -> None:
         """Set the lens and the size of the images on disk, with notes on them."""
         self._lens, self._raw_size, self.size = lens, raw_size, reading.check_size(self.size)
+        self._lens_of = lru_cache(NUM_LENSES)(lambda camera: lens.of(camera, raw_size))
         self.calibration = with_notes(lens.about, self._tones and self._tones.note, *notes)
         self.full_intrinsics = lens.intrinsics
         self.intrinsics = reading.resize_intrinsics(lens.intrinsics, raw_size, self.size)
@@ -75,7 +79,7 @@ class Straightened(Dataset):
         return self._lens_at(index).straighten_mask(mask)
 
     def _lens_at(self, index: int) -> Lens:
-        return self._lens if self._cameras is None else self._lens.of(self._cameras[index], self._raw_size)
+        return self._lens if self._cameras is None else self._lens_of(self._cameras[index])
 
     def number(self, index: int) -> int:
         return self._chosen[index]

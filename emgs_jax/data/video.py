@@ -17,7 +17,8 @@ MIN_ASPECT = 0.2  # of a pixel; less means a damaged header
 class Video:
     """A video up to frame `stop`, read from its beginning, as seeking lands on a nearby key frame with many codecs.
 
-    `times` are the seconds of each readable frame; `notes` describe a wrong header and pixels that are not square.
+    `times` are the seconds of each readable frame, `count` is the number of all, beyond `stop` by the header; `notes`
+    describe a wrong header and pixels that are not square.
     """
 
     def __init__(self, path: Path, stop: int | None = None) -> None:
@@ -27,6 +28,7 @@ class Video:
         count = self._next = len(self.times)  # _next: the frame that the capture gives next
         if not count:
             raise ValueError(self._nothing_decoded())
+        self.count = count if stop is None or not math.isfinite(announced) else max(count, int(announced))
         is_short = math.isfinite(announced) and count < (announced if stop is None else min(announced, stop))
         self.notes = [f"{path} announces {announced:.0f} frames, {count} can be read"] if is_short else []
         self._aspect = _pixel_aspect(self._capture)

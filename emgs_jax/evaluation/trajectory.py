@@ -73,14 +73,33 @@ def ate(estimate: np.ndarray, reference: np.ndarray, alignment: Sim3) -> float:
     return _rms(np.linalg.norm(alignment.apply(estimate) - reference, axis=-1))
 
 
-def rpe(estimate: np.ndarray, truth: np.ndarray) -> tuple[float, float]:
-    """RMS translation [m] and rotation [deg] of the error from each pose to the next, at the estimate's own scale."""
-    distances, angles = pose_difference(*(np.linalg.inv(path[:-1]) @ path[1:] for path in (truth, estimate)))
+def rpe(estimate: np.ndarray, truth: np.ndarray, frames: np.ndarray | None = None) -> tuple[float, float]:
+    """RMS translation [m] and rotation [deg] of the error from each pose to the next, at the estimate's own scale.
+
+    Args:
+        estimate: poses (n, 4, 4).
+        truth: likewise.
+        frames: number of each pose's frame (n,): where frames between two are missing, these do not count. None: all
+            poses follow each other.
+
+    Raises:
+        DegenerateTrajectoryError: no two frames follow each other.
+    """
+    follows = np.ones(len(estimate) - 1, bool) if frames is None else np.diff(frames) == 1
+    if not follows.any():
+        raise DegenerateTrajectoryError("no two frames with a pose follow each other")
+    motions = (np.linalg.inv(path[:-1][follows]) @ path[1:][follows] for path in (truth, estimate))
+    distances, angles = pose_difference(*motions)
     return _rms(distances), _rms(angles)
 
 
-def trajectory_metrics(estimate: np.ndarray, truth: np.ndarray) -> dict[str, float | int | str | None]:
-    """Compare poses (n, 4, 4) row by row; flat keys; None where undefined, with `trajectory/reason`."""
+def trajectory_metrics(
+    estimate: np.ndarray, truth: np.ndarray, frames: np.ndarray | None = None
+) -> dict[str, float | int | str | None]:
+    """Compare poses (n, 4, 4) row by row; flat keys; None where undefined, with `trajectory/reason`.
+
+    `frames` are the numbers of their frames, see `rpe`.
+    """
     estimate, truth = np.asarray(estimate, np.float64), np.asarray(truth, np.float64)
     if estimate.shape != truth.shape or estimate.shape[1:] != (4, 4):
         raise ValueError(f"poses must be two equal (n, 4, 4), got {estimate.shape} and {truth.shape}: associate first")
@@ -89,7 +108,9 @@ def trajectory_metrics(estimate: np.ndarray, truth: np.ndarray) -> dict[str, flo
     metrics["trajectory/num_frames"] = len(estimate)
     try:
         _checked(estimate.reshape(-1, 16), truth.reshape(-1, 16), 2)
-        metrics["trajectory/rpe_translation_m"], metrics["trajectory/rpe_rotation_deg"] = rpe(estimate, truth)
+        if frames is None or (np.diff(frames) == 1).any():
+            errors = rpe(estimate, truth, frames)
+            metrics["trajectory/rpe_translation_m"], metrics["trajectory/rpe_rotation_deg"] = errors
         x, y = estimate[:, :3, 3], truth[:, :3, 3]
         metrics["trajectory/ate_se3_m"] = ate(x, y, align(x, y, with_scale=False))
         similarity = align(x, y, with_scale=True)

@@ -39,19 +39,25 @@ def write_file(path: str | os.PathLike, content: str | bytes) -> None:
 
 @contextlib.contextmanager
 def new_folder(path: Path) -> Iterator[Path]:
-    """Make a folder that becomes `path` if the block succeeds, else is removed; ValueError if `path` exists."""
+    """Make a folder that becomes `path` if the block succeeds, else is removed.
+
+    Raises:
+        ValueError: `path` exists, or another program is making it.
+    """
     if path.exists():
         raise ValueError(f"{path} is there already: remove it, or write elsewhere")
     partial = path.with_name(f".{path.name}.partial")
-    shutil.rmtree(partial, ignore_errors=True)  # a killed program may have left it
     try:
-        partial.mkdir(parents=True)
-        yield partial
-        os.rename(partial, path)
+        with owned(partial):
+            try:
+                for left in partial.iterdir():  # by a program that was killed
+                    shutil.rmtree(left) if left.is_dir() else left.unlink()
+                yield partial
+                os.rename(partial, path)
+            finally:
+                shutil.rmtree(partial, ignore_errors=True)
     except OSError as error:
         raise _named(error, path) from error
-    finally:
-        shutil.rmtree(partial, ignore_errors=True)
 
 
 @contextlib.contextmanager

@@ -1,10 +1,11 @@
 """Outcome of an input, from which the pose graph and the log of its frames are made."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from emgs_jax.existence import Seen
 from emgs_jax.slam import StepInfo
 
 # Outcomes of relocalization, `Event.location`, as written in files.
@@ -25,6 +26,7 @@ class Event:
         similarity: from the submap of the frame to the one that it was joined with, (4, 4).
         covariance: (6, 6) of the pose, see `FrameRecord`; None without a step.
         seconds: that it took, see `FrameRecord`.
+        seen: the last frames of a submap that is joined, see `end_looks`.
     """
 
     poses: np.ndarray
@@ -36,6 +38,7 @@ class Event:
     similarity: np.ndarray | None = None
     covariance: np.ndarray | None = None
     seconds: Mapping[str, float] = field(default_factory=dict)
+    seen: Sequence[Seen] = ()
 
     @property
     def is_tracked(self) -> bool:

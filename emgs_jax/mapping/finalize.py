@@ -44,6 +44,16 @@ def end_looks(state: SlamState, camera: Camera, config: SlamConfig) -> tuple[Sla
     return replace(state, map=map, looks=None), each
 
 
+def end_looks_of(atlas: Atlas, number: int) -> tuple[Atlas, list[Seen]]:
+    """Apply `end_looks` to a submap that no further frame is fused into; a frozen map stays."""
+    submap = atlas.submaps[number]
+    state, seen, looks = replace(submap.state, looks=None), [], submap.state.looks
+    if looks is not None and (np.asarray(looks.time) >= 0).any():
+        state, seen = end_looks(submap.state, atlas.camera, atlas.config)
+        state = replace(state, map=submap.state.map) if submap.is_frozen else state
+    return replace(atlas, submaps={**atlas.submaps, number: replace(submap, state=state)}), seen
+
+
 @eqx.filter_jit
 def _end_looks(state: SlamState, view: Camera, config: ExistenceConfig) -> tuple[GaussianMap, Seen]:
     def end(map: GaussianMap, look: Looks) -> tuple[GaussianMap, Seen]:

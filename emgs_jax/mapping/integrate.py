@@ -25,6 +25,7 @@ from emgs_jax.loop_closure.prior_query import PriorQuery
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.mapping.atlas import Atlas, join_at, with_state
 from emgs_jax.mapping.event import NEW_SUBMAP, RELOCALIZED, Event
+from emgs_jax.mapping.finalize import end_looks_of
 from emgs_jax.mapping.tracking import Found, anchor_world, place
 from emgs_jax.mapping.window_input import WindowInput
 
@@ -42,6 +43,9 @@ def integrate(
     atlas, event, found = place(atlas, window)
     event = replace(event, seconds=seconds_of(window, timer))
     atlas = replace(atlas, num_lost=0 if event.is_placed else atlas.num_lost + 1)
+    if found is not None and not atlas.is_frozen:  # its last frames have none after them once it is joined
+        atlas, seen = end_looks_of(atlas, found.submap)
+        event = replace(event, seen=seen)
     with contextlib.nullcontext() if atlas.graph.config is None else clock.phase("back_end"):
         return update_graph(atlas, window, event, found, query), event
 

@@ -7,12 +7,13 @@ from dataclasses import replace
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.device.clock import Timer
-from emgs_jax.mapping.atlas import Atlas, set_unjoined_apart, with_state
+from emgs_jax.existence import Seen
+from emgs_jax.mapping.atlas import Atlas, set_unjoined_apart
 from emgs_jax.mapping.capacity import prepare_step
 from emgs_jax.mapping.checkpoint import Keeper
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.event import Event
-from emgs_jax.mapping.finalize import end_looks, rescale_atlas, with_first_frame
+from emgs_jax.mapping.finalize import end_looks_of, rescale_atlas, with_first_frame
 from emgs_jax.mapping.integrate import finish_back_end, integrate, seconds_of
 from emgs_jax.mapping.records import FrameRecord, records_of, with_moved_nodes, with_moved_pixels, with_unjoined_apart
 from emgs_jax.mapping.run import MappingRun
@@ -85,11 +86,19 @@ def map_input(run: MappingRun, window: WindowInput) -> tuple[MappingRun, Sequenc
 
 def with_outcome(run: MappingRun, atlas: Atlas, event: Event) -> MappingRun:
     """Set the atlas of a run with the records of an input, and update the log of earlier frames by it."""
-    if event.info is None or event.info.seen is None:
-        return with_atlas(run, atlas)
-    time = int(atlas.state.time) - 1
-    records = with_moved_pixels(run.records, event.info.seen, time, event.info.moving.shape)
-    return with_atlas(replace(run, records=records), atlas)
+    seen = [*event.seen, *filter(None, [event.info and event.info.seen])]
+    if seen:
+        run = with_seen(run, seen, int(atlas.state.time) - 1)
+    return with_atlas(run, atlas)
+
+
+def with_seen(run: MappingRun, all_seen: Sequence[Seen], time: int) -> MappingRun:
+    """Update the records of earlier frames by what moved in them; `time` is that of the last record's frame."""
+    records = run.records
+    for seen in all_seen:
+        view = downscale(run.camera, run.config.observation.thin)
+        records = with_moved_pixels(records, seen, time, (view.height, view.width))
+    return replace(run, records=records)
 
 
 def with_atlas(run: MappingRun, atlas: Atlas) -> MappingRun:
@@ -116,11 +125,8 @@ def finish_run(run: MappingRun, is_interrupted: bool = False) -> MappingRun:
 
 
 def with_looks_ended(run: MappingRun, time: int) -> MappingRun:
-    """Apply `end_looks` to a run after its last input; `time` is that of the last record's frame."""
-    if run.state is None or run.state.looks is None:
-        return run
-    state, all_seen = end_looks(run.state, run.camera, run.config)
-    view, records = downscale(run.camera, run.config.observation.thin), run.records
-    for seen in all_seen:
-        records = with_moved_pixels(records, seen, time, (view.height, view.width))
-    return replace(run, atlas=with_state(run.atlas, state, run.config), records=records)
+    """Apply `end_looks` to all submaps of a run after its last input; `time` is that of the last record's frame."""
+    for number in run.atlas.submaps:
+        atlas, seen = end_looks_of(run.atlas, number)
+        run = with_seen(replace(run, atlas=atlas), seen, time)
+    return run

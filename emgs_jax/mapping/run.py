@@ -101,13 +101,14 @@ def new_run(
     """Make a run of `dataset` before its first frame; `graph` gives it a back end, `saved` that of an earlier run.
 
     Raises:
-        ValueError: `saved` is combined with `merged` initialization, or JAX computes in float64.
+        ValueError: `saved` is combined with `merged` initialization, JAX computes in float64, or as `check_settings`.
     """
     if jax.config.jax_enable_x64:
         raise ValueError(
             'JAX_ENABLE_X64 is set, and maps are made in float32: jax.config.update("jax_enable_x64", False) turns it '
             "off, or unset JAX_ENABLE_X64"
         )
+    check_settings(config)
     back_end = BackEnd(graph, tuple(dataset.intrinsics), float(config.fit.min_std))
     clock, camera = Clock() if clock is None else clock, to_camera(dataset)
     for words in clamped(config, camera):
@@ -120,6 +121,33 @@ def new_run(
     return MappingRun(
         Atlas(camera, config, replace(saved.back_end, active=None), {0: unvisited(saved, camera, config)}), clock
     )
+
+
+def check_settings(config: SlamConfig) -> None:
+    """Raise ValueError, with the reason, for settings by which no map could be made, or no frame be tracked in it."""
+    existence, motion, pixels = config.existence, config.motion, config.fit.points_per_gaussian
+    names = "birth", "hit", "miss", "max_log_odds", "refuted"
+    birth, hit, miss, most, refuted = (float(getattr(existence, name)) for name in names)
+    highest = most if hit > 0 else min(birth, most) if miss > 0 else birth
+    shown = " ".join(f"slam.existence.{name}={float(getattr(existence, name)):g}" for name in names)
+    if highest <= 0:
+        raise ValueError(
+            f"{shown}: no Gaussian would ever be confirmed, which takes log-odds above 0, and frames are tracked by "
+            "these: raise max_log_odds, or birth or hit"
+        )
+    if (min(birth + hit, most) if hit > 0 else birth) < refuted:
+        raise ValueError(f"{shown}: every Gaussian would be removed after the next frame: lower refuted")
+    prior, look = float(motion.prior), float(motion.hit)
+    if motion.num_looks and float(motion.miss) > 0 and prior + look <= 0:
+        raise ValueError(
+            f"slam.motion.prior={prior:g} slam.motion.hit={look:g}: all that one earlier frame confirms would be taken "
+            "for moving, and no frame be tracked: their sum must be above 0"
+        )
+    if pixels > REFERENCE:
+        raise ValueError(
+            f"slam.fit.points_per_gaussian={pixels} makes no Gaussian of an image, which counts as {REFERENCE} pixels "
+            "(518 × 392) whatever its size: give fewer, such as 85"
+        )
 
 
 def clamped(config: SlamConfig, camera: Camera) -> list[str]:
@@ -155,12 +183,17 @@ def with_truth(run: MappingRun, poses: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
     Poses of lost frames are guesses, and those of submaps that were never joined are in a world of their own.
     """
-    rows = zip(poses, run.true_poses, run.records, strict=True)
-    pairs = [(pose, true) for pose, true, record in rows if true is not None and record.status not in UNPLACED]
-    if not pairs:
+    rows = rows_with_truth(run)
+    if not len(rows):
         return None
-    estimate, truth = zip(*pairs, strict=True)
-    return np.stack(estimate), np.stack(truth).astype(np.float64)
+    estimate, truth = (np.stack([path[row] for row in rows]) for path in (poses, run.true_poses))
+    return estimate, truth.astype(np.float64)
+
+
+def rows_with_truth(run: MappingRun) -> np.ndarray:
+    """Return the rows of the records of placed frames whose truth is known; those of `with_truth`."""
+    rows = zip(run.true_poses, run.records, strict=True)
+    return np.flatnonzero([true is not None and record.status not in UNPLACED for true, record in rows])
 
 
 def placed_percent(run: MappingRun) -> float:

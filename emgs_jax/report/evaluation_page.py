@@ -73,7 +73,8 @@ def run_facts(metrics: Mapping[str, Any]) -> str:
     block = metrics.get("provenance", {})
     share = metrics.get(PLACED_PERCENT, 100)
     of = "" if share == 100 else f" over {share:.0f} % of the frames"
-    words = ["no ground truth"] if ours is None else [f"path off by {length_words(ours, block)}{of}"]
+    lacking = "no placed frame has a true pose" if PLACED_PERCENT in metrics else "no ground truth"
+    words = [lacking] if ours is None else [f"path off by {length_words(ours, block)}{of}"]
     if ours is not None and raw is not None:
         words[0] += f" (prior alone: {length_words(raw, block)})"
     counts = {status: metrics.get(f"frames/{status}") for status in ("tracked", "degraded", "lost", "skipped")}

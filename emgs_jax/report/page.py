@@ -65,20 +65,22 @@ def _splats(run: FinishedRun) -> tuple[dict[str, Any] | None, str, str, np.ndarr
 
 
 def _path_arrays(run: FinishedRun, paths: PlacedPaths) -> dict[str, np.ndarray]:
-    """Collect the upper three rows of the known poses (n, 12), float32, in the frame of the map."""
-    found = {"poses": run.poses, "online": run.online, "truth": paths.truth, "raw": paths.raw}
+    """Collect the upper three rows of the poses (n, 12), float32, in the frame of the map; nan where not placed."""
+    placed = np.where(run.is_placed[:, None, None], run.poses, np.nan)
+    found = {"poses": placed, "online": run.online, "truth": paths.truth, "raw": paths.raw}
     return {
         name: poses[:, :3].reshape(-1, 12).astype(np.float32)
         for name, poses in found.items()
-        if poses is not None and np.isfinite(poses).any()
+        if poses is not None and (name == "poses" or np.isfinite(poses).any())
     }
 
 
 def _about(run: FinishedRun, layers: dict[str, np.ndarray]) -> dict[str, Any]:
     """Collect the data that the page's program needs, besides the attributes of Gaussians."""
-    means = layers["mean"].astype(np.float64) if len(layers["mean"]) else run.poses[:, :3, 3]
-    low, high = np.percentile(np.concatenate([means, run.poses[:, :3, 3]]), [1, 99], axis=0)
-    rotation = view_from_above(run.poses)
+    poses = run.poses[run.is_placed] if run.is_placed.any() else run.poses[:1]
+    means = layers["mean"].astype(np.float64) if len(layers["mean"]) else poses[:, :3, 3]
+    low, high = np.percentile(np.concatenate([means, poses[:, :3, 3]]), [1, 99], axis=0)
+    rotation = view_from_above(poses)
     camera, names = run.camera, () if run.text is None else run.text.names
     (fx, fy), (cx, cy) = map(float, camera.focal), map(float, camera.center)
     return {
@@ -127,6 +129,7 @@ def _page(
         "strip": strip(run, paths.errors),
         "key": key_of(run, paths.errors),
         "errors": page_words.errors(run),
+        "no_errors": page_words.no_errors(run),
         "protocol": page_words.protocol_words(run),
         "polished": page_words.polished(run),
         "loops": page_words.loops(run),

@@ -75,6 +75,11 @@ def loop_words(run: FinishedRun, loop: dict[str, Any]) -> str:
     return f"frames {frame} and {other}: {loop_why(loop)}"
 
 
+def no_errors(run: FinishedRun) -> str:
+    """Say why a run without errors has none."""
+    return "no placed frame has a true pose" if run.has_truth.any() else "the data set has no ground truth"
+
+
 def verdict(run: FinishedRun) -> tuple[str, str]:
     """Judge as `good`, `mixed`, `bad` or `unknown`, in one sentence; without ground truth by the tracking alone.
 
@@ -94,7 +99,7 @@ def verdict(run: FinishedRun) -> tuple[str, str]:
     ours, raw = (metrics.get(prefix + MAIN[0].key) for prefix in ("", RAW_PRIOR))
     if ours is None:
         level = "bad" if is_lost else "mixed" if is_degraded else "unknown"
-        return level, f"{tracked}. There is no ground truth that errors could be told from."
+        return level, f"{tracked}. There are no errors to tell: {no_errors(run)}."
     words = f"The path is off by {length_words(ours, run.provenance)} (RMS, placed with its scale)"
     is_worse = raw is not None and ours > raw
     if raw:

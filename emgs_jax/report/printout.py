@@ -30,6 +30,7 @@ from emgs_jax.report.columns import (
     metric_table,
 )
 from emgs_jax.runs.moving import MUCH
+from emgs_jax.runs.provenance import PLACED_PERCENT
 
 MANY = 0.1  # share of frames
 POLISHED = (  # key of polish.json, words, digits
@@ -107,6 +108,12 @@ def metrics_table(metrics: Mapping[str, Any]) -> str:
     return "\n\n".join(tables)
 
 
+def why_no_errors(metrics: Mapping[str, Any]) -> str:
+    """Say why a run has no errors."""
+    why = "no placed frame has a true pose" if PLACED_PERCENT in metrics else "no ground truth"
+    return f"{why}, so no errors"
+
+
 def _label(block: Mapping[str, Any]) -> str:
     """Label a table: empty for measured numbers, otherwise `simulated` with its version."""
     if not block.get("simulated", False):
@@ -117,9 +124,12 @@ def _label(block: Mapping[str, Any]) -> str:
 
 def polish_lines(found: Mapping[str, Any]) -> list[str]:
     """Describe the held-out frames by polish.json, in lines."""
-    lines = [f"{found['polish/num_splats']:,} splats; of {found['polish/num_held_out']} frames that were not fitted:"]
+    held = found["polish/num_held_out"]
+    covered = found.get("polish/num_covered", held)  # earlier versions counted all
+    of = held if covered == held else f"the {covered} that the map covers of {held}"
+    lines = [f"{found['polish/num_splats']:,} splats; of {of} frames that were not fitted:"]
     lines.append(aligned(polish_table(found)))
-    if found["polish/after_psnr_db"] < found["polish/before_psnr_db"]:
+    if covered and found["polish/after_psnr_db"] < found["polish/before_psnr_db"]:
         lines.append("the splats show less than the map: the frames are too few, or too far apart (dataset.stride=…)")
     return lines
 

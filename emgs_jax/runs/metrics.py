@@ -37,7 +37,7 @@ from emgs_jax.gaussian_map import confirmed
 from emgs_jax.gaussians import Gaussians
 from emgs_jax.geometry import scale_pose
 from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, FrameRecord, longest_row, records_apart
-from emgs_jax.mapping.run import MappingRun, placed_percent, row_of_first_node, with_truth
+from emgs_jax.mapping.run import MappingRun, placed_percent, row_of_first_node, rows_with_truth, with_truth
 from emgs_jax.prior.base import Prior
 from emgs_jax.runs.back_end import counts, found_loops
 from emgs_jax.runs.gathering import Baselines, RawPrior, Text
@@ -101,9 +101,11 @@ def score_map(
     """
     poses, truth, config = with_truth(run, run.poses), scorer.truth, scorer.evaluation
     if poses is None:
-        return {}
+        has_truth = any(pose is not None for pose in run.true_poses)
+        return {PLACED_PERCENT: placed_percent(run)} if has_truth else {}
     other = replace(config, alignment="se3" if config.alignment == "sim3" else "sim3")
-    metrics = trajectory_metrics(*poses) | {PLACED_PERCENT: placed_percent(run)} | score_cloud(dense, poses, scorer)
+    metrics = trajectory_metrics(*poses, rows_with_truth(run))
+    metrics |= {PLACED_PERCENT: placed_percent(run)} | score_cloud(dense, poses, scorer)
     if other.alignment == "sim3" or scorer.is_metric:
         compared = compare_clouds(dense, truth, poses, other)
     else:
@@ -140,7 +142,8 @@ def score_prior(run: MappingRun, raw: RawPrior, scorer: Scorer) -> Metrics:
         rendered.add(row, raw.points[row][..., 2], None, names and translate(raw.classes[row], *names))
     with ThreadPoolExecutor(1, "classes of the raw prior") as thread:
         of_labels = thread.submit(_score_labels, raw.labels, poses, scorer)
-        metrics = trajectory_metrics(*poses) | {PLACED_PERCENT: placed_percent(run)}  # over the frames of ours
+        metrics = trajectory_metrics(*poses, rows_with_truth(run))  # over the frames of ours
+        metrics |= {PLACED_PERCENT: placed_percent(run)}
         metrics |= score_cloud(raw.cloud, poses, scorer) | rendered.metrics()
         return prefixed(metrics | of_labels.result(), RAW_PRIOR)
 
@@ -225,7 +228,7 @@ def score_back_end(run: MappingRun) -> Metrics:
     online = [node.online for node in end.nodes[end.first_node :]]
     before = [record.pose for record in run.records[: row_of_first_node(run)]]
     poses = with_truth(run, np.stack([*before, *online])) if online else None
-    causal = {} if poses is None else trajectory_metrics(*poses)
+    causal = {} if poses is None else trajectory_metrics(*poses, rows_with_truth(run))
     causal = {key.replace("trajectory/", "trajectory_online/"): x for key, x in causal.items()}
     found = Counter(record.location for record in run.records if record.location is not None)
     located = {f"location/{name}": count for name, count in sorted(found.items())}

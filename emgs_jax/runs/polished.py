@@ -62,7 +62,10 @@ def polish(
     rows = [int(row) for row in np.flatnonzero(run.is_placed)]
     held, fitted_rows = ([row for row in rows if is_held_out(row, config) == kind] for kind in (True, False))
     if not held or not fitted_rows:
-        raise ValueError(f"{run.folder} has {len(rows)} placed frames: too few to fit some and compare others")
+        raise ValueError(
+            f"{run.folder} has {len(rows)} placed frames, of which polishing fits some and compares the others "
+            f"(polish.held_out_every={config.held_out_every}): map more frames (dataset.stop, dataset.stride)"
+        )
 
     def seen(row: int) -> Seen:
         view = jax.device_get(_densify(gaussians, to_se3(run.poses[row]), run.camera, densify_config))
@@ -192,7 +195,8 @@ def _compare(
     """Compute PSNR and SSIM over pixels that the map covers, and depth errors and ATE where the truth is known.
 
     *Before* is the map at the run's poses, *after* the splats at theirs. Where the map covers nothing, both pictures
-    equal the image in SSIM and do not count in PSNR. No pixel of a held-out frame is used to estimate its brightness.
+    equal the image in SSIM and do not count in PSNR; a frame of which the map covers nothing does not count at all. No
+    pixel of a held-out frame is used to estimate its brightness.
     """
     splats, opacity, poses, gains, terms = drawn
     known = run.has_truth & run.is_placed
@@ -214,14 +218,15 @@ def _compare(
             "before": (view.colors, np.where(view.valid, view.depth, 0.0)),
             "after": (np.float32(gains[row]) * after.values, after.depth),
         }
-        for name, (colors, depth) in pictures.items():
+        for name, (colors, depth) in pictures.items() if view.valid.any() else ():
             shown = np.where(view.valid[..., None], np.clip(colors, 0, 1), image).astype(np.float32)
             psnr[name].append(np.mean((shown - image)[view.valid] ** 2))
             similarity[name].append(float(_ssim(shown, image)))
             if scale is not None:
                 scores[name].append(score_view(dataset[row], depth, colors, scale, np.inf))
         strips.append(np.concatenate([image, np.clip(view.colors, 0, 1), np.clip(pictures["after"][0], 0, 1)], axis=1))
-    for name in scores:
+    metrics["polish/num_covered"] = len(psnr["before"])
+    for name in scores if psnr["before"] else ():
         metrics[f"polish/{name}_psnr_db"] = float(-10 * np.log10(max(np.mean(psnr[name]), 1e-12)))
         metrics[f"polish/{name}_ssim"] = float(np.mean(similarity[name]))
         for key, value in rendering_metrics(scores[name]).items() if scale is not None else ():

@@ -1,23 +1,26 @@
 """Models of COLMAP that are there: read from their folders, and those of a user brought to the images in use."""
 
 import shutil
+import sqlite3
 import tempfile
 from collections.abc import Sequence
+from contextlib import closing, suppress
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from tqdm import tqdm
 
-from emgs_jax.data.colmap_model import check_whole
+from emgs_jax.data.colmap_model import check_whole, is_model, load_colmap
 from emgs_jax.data.masks import stem
+from emgs_jax.data.reading import stretch
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.library import load
 from emgs_jax.structure.reconstruct import DATABASE, Shots, map_database
 
 PARTS = ("cameras", "images")
 SAME_FOCAL = 0.01  # relative difference up to which cameras are one: less than what it costs to map as another
-MAX_STRETCH = 0.01  # relative difference of the sides' ratio, of a model's images and these
+MAX_STRETCH = 0.01  # of a model's images and these: sides are whole pixels
 SQLITE = b"SQLite format 3\0"  # how its files begin
 
 
@@ -58,8 +61,8 @@ def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any
     key = f"prior.structure.model={config.model}"
     if not place.exists():
         raise ValueError(f"{key} does not exist: give the folder of a COLMAP model, or a database")
-    is_model = any(any(folder.glob("cameras.*")) for folder in (place, *place.glob("[0-9]*")) if folder.is_dir())
-    if is_model or not database.is_file():
+    has_model = any(any(folder.glob("cameras.*")) for folder in (place, *place.glob("[0-9]*")) if folder.is_dir())
+    if has_model or not database.is_file():
         models = read_models(place)
     else:
         with database.open("rb") as handle:
@@ -107,6 +110,18 @@ def take_camera(database: Path, shots: Shots, key: str) -> None:
             opened.update_camera(known)
 
 
+def names_at(place: Path) -> set[str]:
+    """Names of the images of the models in a folder, or of a database; none where it cannot be read."""
+    database = place if place.suffix == ".db" else place / DATABASE
+    folders = [folder for folder in (place, *place.glob("[0-9]*")) if is_model(folder)]
+    with suppress(ValueError, OSError, sqlite3.Error):  # whoever reads it says why
+        if not folders and database.is_file():
+            with closing(sqlite3.connect(f"{database.resolve().as_uri()}?mode=ro", uri=True)) as opened:
+                return {stem(name) for (name,) in opened.execute("SELECT name FROM images")}
+        return {stem(name) for folder in folders for name in load_colmap(folder).names}
+    return set()
+
+
 def in_use(model: Any, names: Sequence[str]) -> list[Any]:
     """The images of a model that have a pose and one of these names."""
     wanted = {*names}
@@ -134,7 +149,7 @@ def resize(model: Any, shots: Shots, key: str) -> None:
 
 def check_shape(found: tuple[int, int], size: tuple[int, int], key: str) -> None:
     """ValueError where images of `found` (width, height) are no copies of those of `size`."""
-    if abs(found[0] * size[1] / (found[1] * size[0]) - 1) > MAX_STRETCH:
+    if stretch(found, size) > MAX_STRETCH:
         raise ValueError(
             f"{key} is of images of {found[0]}x{found[1]}, which are no copies of those of {size[0]}x{size[1]}: give "
             "the images that the model was made of"

@@ -4,7 +4,9 @@ COLMAP's tangent of a pose (R, t), camera from world, is z = (q, b): R' = Exp(2 
 inverse, T_world_camera Exp(xi), translation first: xi = (-b - t x 2 q, -2 q).
 """
 
-from collections.abc import Mapping
+import tempfile
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -15,6 +17,9 @@ from emgs_jax.geometry import adjoint
 from emgs_jax.structure.library import bundle_of, load, options_of
 
 NUM_REFERENCES = 32  # frames that determine the unit
+# Frames of a stretch, of which the first were in the one before, too; and its images, not all of which are in use. Time
+# grows with the cube of these.
+STRETCH, OVERLAP, MOST = 120, 20, 160
 
 
 def camera_in_world(image: Any) -> Float[np.ndarray, "4 4"]:
@@ -31,7 +36,42 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
     A common factor of all lengths is no error either: the factor s = sum(w_r xi_r) of some of the frames is removed,
     xi_i - g_i s, where g_i is the change of xi_i by log s. The standard deviation of residuals is their own, or
     `pixel_std` if that is larger. Frames without a covariance are left out.
+
+    A large model is taken in stretches, each with the images that show most of its points and with a unit of its own.
     """
+    # The mean length of a 2D error of standard deviation s is s sqrt(pi / 2).
+    scale = max(2 / np.pi * model.compute_mean_reprojection_error() ** 2, pixel_std**2)
+    if model.num_reg_images() <= MOST:
+        return _of_stretch(model, images, scale)
+    frames, spread = [*images], {}
+    for begin in range(0, max(len(frames) - OVERLAP, 1), STRETCH - OVERLAP):
+        own = {frame: images[frame] for frame in frames[begin : begin + STRETCH]}
+        few = _part(model, [image.image_id for image in own.values()])
+        found = _of_stretch(few, {frame: few.images[image.image_id] for frame, image in own.items()}, scale)
+        known = {*frames[: begin + OVERLAP // 2]} if begin else set()  # by what is on both sides of them
+        spread |= {frame: one for frame, one in found.items() if frame not in known}
+    return spread
+
+
+def _part(model: Any, wanted: Sequence[int]) -> Any:
+    """The model of these images and of those that show most of their points, `MOST` in all."""
+    points = {p.point3D_id for image in wanted for p in model.images[image].points2D if p.has_point3D()}
+    shown = Counter(one.image_id for point in points for one in model.points3D[point].track.elements)
+    for image in wanted:
+        shown.pop(image, None)
+    kept = {*wanted, *(image for image, _ in shown.most_common(max(MOST - len(wanted), 0)))}
+    frames = {model.images[image].frame_id for image in kept}
+    found = load().Reconstruction(model)
+    for frame in [*found.reg_frame_ids()]:
+        if frame not in frames:
+            found.deregister_frame(frame)
+    with tempfile.TemporaryDirectory() as folder:  # what has no pose is not written, and would end the covariances
+        found.write_binary(folder)
+        return load().Reconstruction(folder)
+
+
+def _of_stretch(model: Any, images: Mapping[int, Any], scale: float) -> dict[int, Float[np.ndarray, "6 6"]]:
+    """`covariances` of a model as a whole, for this variance of residuals."""
     found = _covariance(model, next(iter(images.values())))
     if found is None:
         return {}
@@ -63,8 +103,6 @@ def covariances(model: Any, images: Mapping[int, Any], pixel_std: float) -> dict
         mixed = np.outer(with_unit[a], unit[b]) + np.outer(unit[a], with_unit[b])
         return between(a, b) - mixed + variance * np.outer(unit[a], unit[b])
 
-    # The mean length of a 2D error of standard deviation s is s sqrt(pi / 2).
-    scale = max(2 / np.pi * model.compute_mean_reprojection_error() ** 2, pixel_std**2)
     spread = {first: np.zeros((6, 6))}
     for before, frame in pairwise(frames):
         moved = adjoint((np.linalg.inv(T[frame]) @ T[before])[None])[0]

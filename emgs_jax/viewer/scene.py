@@ -84,9 +84,10 @@ class Scene:
         ]
         self._draw_cameras(run)
         if self.chosen is None:
+            placed = run.poses[run.is_placed] if run.is_placed.any() else run.poses[:1]
             self.chosen = self._frustum(run, "/frame", 0, "#ffffff", 0.1)
-            self._scene.set_up_direction(view_from_above(run.poses)[2])
-            self._place_views(run.poses[0])
+            self._scene.set_up_direction(view_from_above(placed)[2])
+            self._place_views(placed[0])
 
     def recolor(self, colors: np.ndarray, of_splats: np.ndarray | None) -> None:
         """Set colours (n, 3) of all Gaussians, and of the splats, if there are any."""
@@ -96,15 +97,17 @@ class Scene:
             self.splats.rgbs = colors
             self.points.colors = colors
 
-    def show(self, kind: str, cameras: bool, paths: bool) -> None:
-        """Choose what is visible: the map as one of `KINDS`, cameras, paths."""
+    def show(self, kind: str, cameras: bool, paths: bool, is_chosen_placed: bool = True) -> None:
+        """Choose what is visible: the map as one of `KINDS`, cameras, paths; a frame has a camera if it is placed."""
         for name, drawn in zip(KINDS, (self.sharp, self.splats, self.points), strict=True):
             if drawn is not None:
                 drawn.visible = kind == name
         for path in filter(None, self.paths):
             path.visible = paths
-        for frustum in filter(None, (*self.frustums.values(), self.chosen)):
+        for frustum in self.frustums.values():
             frustum.visible = cameras
+        if self.chosen is not None:
+            self.chosen.visible = cameras and is_chosen_placed
 
     def choose(self, pose: np.ndarray, image: np.ndarray | None) -> None:
         """Place the frustum of the chosen frame at its pose, with its image if there is one."""
@@ -112,9 +115,9 @@ class Scene:
         self.chosen.image = image
 
     def _draw_cameras(self, run: Shown) -> None:
-        """Draw the cameras; move existing ones, because a back end moves poses."""
-        count = len(run.poses)
-        rows = {int(row) for row in np.linspace(0, count - 1, min(count, MAX_FRUSTUMS))}
+        """Draw the cameras of placed frames; move existing ones, because a back end moves poses."""
+        placed = np.flatnonzero(run.is_placed)
+        rows = {int(row) for row in placed[np.linspace(0, len(placed) - 1, min(len(placed), MAX_FRUSTUMS)).astype(int)]}
         for row in set(self.frustums) - rows:
             self.frustums.pop(row).remove()
         for row in sorted(rows):

@@ -175,13 +175,15 @@ class Viewer:
 
     @_alone
     def _show(self) -> None:
-        self.scene.show(self.kind.value, self.show_cameras.value, self.show_paths.value)
+        is_placed = bool(self._run.frames) and bool(self._run.is_placed[self._row()])
+        self.scene.show(self.kind.value, self.show_cameras.value, self.show_paths.value, is_placed)
 
     @_alone
     def _choose(self) -> None:
         if self._run.frames:
             row = self._row()
             self.scene.choose(self._run.poses[row], self._run.image if row == len(self._run.frames) - 1 else None)
+            self._show()
             self.facts.content = _shown(self._facts(row))
 
     def _row(self) -> int:
@@ -195,7 +197,7 @@ class Viewer:
         return escape(", ".join(filter(None, words)))
 
     def _look(self, client: "viser.ClientHandle | None") -> None:
-        if client is not None and self._run.frames:
+        if client is not None and self._run.frames and self._run.is_placed[self._row()]:
             pose = self._run.poses[self._row()]
             with client.atomic():
                 client.camera.wxyz, client.camera.position = wxyz(pose), pose[:3, 3]

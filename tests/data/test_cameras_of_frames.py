@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from emgs_jax.data import intrinsics
 from emgs_jax.data.posed_images import Colmap, Nerfstudio
 from emgs_jax.data.readable import ReadableFrames
 
@@ -65,6 +66,16 @@ def test_images_of_a_camera_that_focuses_are_brought_to_one(tmp_path, make, bend
         assert np.percentile(inside, 99) <= 4  # without it, up to 60
     assert "are of 6 different cameras (focal lengths of 127." in frames.calibration["note"]
     assert frames.fingerprint() != ReadableFrames(type(frames._dataset)(str(tmp_path), size=SIZE)).fingerprint()
+
+
+def test_the_tables_of_a_camera_are_made_once_for_its_image_and_its_mask(tmp_path, monkeypatch):
+    """Symptom: every read made them anew, which took longer than all else."""
+    made = []
+    monkeypatch.setattr(intrinsics, "tables", lambda *given, real=intrinsics.tables: made.append(1) or real(*given))
+    data = nerfstudio(tmp_path, -0.15)(str(tmp_path), size=SIZE)
+    for row in range(3):
+        data.full(row), data[row], data.straight(row, np.zeros(SIZE[::-1], bool))
+    assert len(made) == 3
 
 
 def test_images_of_two_lenses_are_refused(tmp_path, monkeypatch):

@@ -62,6 +62,20 @@ def test_seconds_whose_last_zeros_are_left_out_are_in_order_of_their_value(names
         assert found(names)[0] == pytest.approx([float(name.removeprefix("a_")) for name in names], abs=1e-9)
 
 
+@pytest.mark.parametrize(
+    "names",
+    [
+        ["20260711_101559.jpg", "20260711_101559(0).jpg", "20260711_101559(1).jpg", "20260711_101600.jpg"],
+        ["IMG_7.jpg", "IMG_7-1.jpg", "IMG_7-2.jpg", "IMG_10.jpg"],
+        ["a.png", "a (1).png", "a (2).png", "a (10).png"],
+    ],
+)
+def test_the_first_image_of_a_burst_has_no_number_and_comes_first(names):
+    """Symptom: `…59(0).jpg` came before `…59.jpg`, as a parenthesis sorts before a point."""
+    order, _ = natural_order([Path("a") / name for name in sorted(names)])
+    assert [sorted(names)[row] for row in order] == names
+
+
 def test_times_in_names_that_go_back_are_told_and_other_numbers_are_not():
     times, note = found(["1_1305031102.5", "2_1305031050.5", "3_1305031103.5"])
     assert times.tolist() == [0, 1, 2] and "go back from 1_1305031102.5.png to 2_1305031050.5.png" in note

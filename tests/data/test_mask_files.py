@@ -1,6 +1,13 @@
-"""Whose mask is it? Oracle: images show a red block that moves, which the mask of each leaves out, and nothing else."""
+"""Whose mask is it? Oracle: images show a red block that moves, which the mask of each leaves out, and nothing else.
+
+Right, whatever the data set, its frames in use, their size and lens: every frame has the mask of its own image, which
+covers what it covers there. Two ways say whose a mask is: its name (and its folders, where names repeat), and for a
+video its frame's number from 0, whatever `start` and `stride`. A mask may be of another size, and of the pixels as they
+are stored where EXIF turns the image. What says neither, or says it of two images, is refused.
+"""
 
 import json
+from collections.abc import Sequence
 from pathlib import Path
 
 import cv2
@@ -75,14 +82,30 @@ def video(root: Path, masks: Path, **keys) -> Images:
     return Images(str(root / "a.mp4"), **{"intrinsics": PINHOLE} | keys)
 
 
-def nerfstudio(root: Path, masks: Path | None, lens: dict[str, float] | None = None, **keys) -> Nerfstudio:
-    """With `mask_path` where no folder is given; every third frame has none."""
+def nerfstudio(
+    root: Path,
+    masks: Path | None,
+    lens: dict[str, float] | None = None,
+    name: str = "images/{:04d}.png",
+    orientation: int = 1,
+    **keys,
+) -> Nerfstudio:
+    """With `mask_path` where no folder is given; every third frame has none.
+
+    With an `orientation` its pixels are as here, and programs that know EXIF would turn them.
+    """
     frames = []
     for row in range(COUNT):
-        write(root / f"images/{row:04d}.png", picture(row))
-        frames.append({"file_path": f"images/{row:04d}.png", "transform_matrix": np.eye(4).tolist()})
+        path = root / name.format(row // 2 if "side" in name else row, side=("a", "b")[row % 2])
+        write(path, picture(row))
+        if orientation > 1:
+            exif = Image.Exif()
+            exif[0x0112] = orientation
+            Image.fromarray(picture(row)).save(path, exif=exif, quality=98)
+        own = path.relative_to(root)
+        frames.append({"file_path": own.as_posix(), "transform_matrix": np.eye(4).tolist()})
         if masks is not None:
-            write(masks / f"{row:04d}.png", mask_of(row))
+            write(masks / own.relative_to("images").with_suffix(".png"), mask_of(row))
         elif row % 3:
             write(root / f"own/m{row}.png", mask_of(row))
             frames[-1]["mask_path"] = f"own/m{row}.png"
@@ -92,15 +115,20 @@ def nerfstudio(root: Path, masks: Path | None, lens: dict[str, float] | None = N
     return Nerfstudio(str(root), **keys)
 
 
-def colmap(root: Path, masks: Path, **keys) -> Colmap:
-    """Two folders of images with the same names."""
+def colmap(root: Path, masks: Path, lens: Sequence[float] = (), orientation: int = 1, **keys) -> Colmap:
+    """Two folders of images with the same names; pixels are as here whatever the `orientation`."""
     names = [f"{side}/{row:03d}.png" for row in range(COUNT // 2) for side in ("left", "right")]
     (root / "sparse/0").mkdir(parents=True)
     fx, fy, cx, cy = PINHOLE
-    (root / "sparse/0/cameras.txt").write_text(f"1 PINHOLE {WIDTH} {HEIGHT} {fx} {fy} {cx + 0.5} {cy + 0.5}\n")
+    camera = f"{'OPENCV' if lens else 'PINHOLE'} {WIDTH} {HEIGHT} {fx} {fy} {cx + 0.5} {cy + 0.5}"
+    (root / "sparse/0/cameras.txt").write_text(" ".join(map(str, (1, camera, *lens))) + "\n")
     lines = []
     for row, name in enumerate(names):
         write(root / "images" / name, picture(row))
+        if orientation > 1:
+            exif = Image.Exif()
+            exif[0x0112] = orientation
+            Image.fromarray(picture(row)).save(root / "images" / name, exif=exif)
         write(masks / f"{name}.png", mask_of(row))
         lines += [f"{row + 1} 1 0 0 0 {row} 0 0 1 {name}", ""]
     (root / "sparse/0/images.txt").write_text("\n".join(lines) + "\n")
@@ -122,10 +150,19 @@ CASES = {
     "video, every third": lambda r, m: video(r, m, stride=3),
     "video, from the fifth": lambda r, m: video(r, m, start=5, stop=9),
     "video through a lens": lambda r, m: video(r, m, intrinsics=LENS, stride=2),
+    "video, frames of another shape": lambda r, m: video(r, m, size=(96, 128), start=2),
     "nerfstudio": lambda r, m: nerfstudio(r, m, stride=2),
+    "nerfstudio, from the third": lambda r, m: nerfstudio(r, m, start=3, stop=9),
+    "nerfstudio, frames of another shape": lambda r, m: nerfstudio(r, m, size=(128, 128)),
+    "nerfstudio, two folders": lambda r, m: nerfstudio(r, m, name="images/{side}/{:03d}.png", start=1),
+    "nerfstudio, EXIF that nobody heeds": lambda r, m: nerfstudio(r, m, name="images/{:04d}.jpg", orientation=3),
     "nerfstudio through a lens": lambda r, m: nerfstudio(r, m, {"k1": -0.3, "k2": 0.1}),
     "COLMAP": lambda r, m: colmap(r, m),
     "COLMAP, every fifth": lambda r, m: colmap(r, m, start=1, stride=5),
+    "COLMAP, frames of another shape": lambda r, m: colmap(r, m, size=(128, 128)),
+    "COLMAP through a lens": lambda r, m: colmap(r, m, LENS[4:], stride=2),
+    "COLMAP, EXIF that nobody heeds": lambda r, m: colmap(r, m, orientation=3),
+    "photos through a lens that EXIF turns": lambda r, m: photos_on_their_side(r, m, 6, intrinsics=LENS, stride=2),
 }
 
 
@@ -192,6 +229,18 @@ def test_masks_that_are_those_of_other_frames_are_refused(tmp_path):
         write(flat / f"{row:03d}.png", mask_of(row))
     with pytest.raises(ValueError, match="is the mask of 2 images: put masks into folders"):
         ReadableFrames(both, masks=Masks(str(flat)))
+
+
+def test_an_image_that_cannot_be_read_needs_no_mask_where_it_is_skipped(tmp_path):
+    """Symptom: `on_bad_frame=skip` ended for want of the mask of an image that it skips."""
+    data = photos(tmp_path / "data", tmp_path / "masks")
+    (tmp_path / "data/IMG 3.png").write_bytes(b"\x89PNG\r\n\x1a\n")
+    (tmp_path / "masks/IMG 3.png").unlink()
+    frames = ReadableFrames(data, "skip", masks=Masks(str(tmp_path / "masks"), border=0))
+    assert [*frames.skipped] == [3] and len(frames) == COUNT - 1 and max(map(wrong, frames)) < 0.02
+    (tmp_path / "masks/IMG 5.png").unlink()
+    with pytest.raises(ValueError, match="has no mask for IMG 5 .and 0 more."):
+        ReadableFrames(data, "skip", masks=Masks(str(tmp_path / "masks")))
 
 
 def test_masks_that_leave_out_most_are_said(tmp_path):

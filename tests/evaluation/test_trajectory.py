@@ -256,3 +256,22 @@ def test_an_estimate_in_another_convention_is_named(written, words):
         check_conventions(np.stack([written(pose) for pose in estimate]), truth, "path.txt")
     check_conventions(random_poses(rng, 20), truth, "nothing that is known")
     check_conventions(estimate[:2], truth[:2], "two poses say little")
+
+
+def test_a_gap_of_frames_is_no_step():
+    """Symptom: five lost frames were one step, five times as long and as wrong as the others."""
+    rng = np.random.default_rng(3)
+    truth = random_poses(rng, 12)
+    estimate = noisy(rng, truth, 0.01)
+    estimate[8:] = np.array([[1, 0, 0, 3.0], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]) @ estimate[8:]  # off by 3 m
+    frames = np.r_[0:8, 13:17]
+    parts = [rpe(estimate[part], truth[part]) for part in (slice(8), slice(8, None))]
+    expected = [np.sqrt((7 * a**2 + 3 * b**2) / 10) for a, b in zip(*parts, strict=True)]
+    np.testing.assert_allclose(rpe(estimate, truth, frames), expected, rtol=1e-9)
+    assert rpe(estimate, truth)[0] > 5 * expected[0]
+    found = trajectory_metrics(estimate, truth, frames)
+    assert (found["trajectory/rpe_translation_m"], found["trajectory/rpe_rotation_deg"]) == pytest.approx(expected)
+    apart = trajectory_metrics(estimate, truth, 2 * np.arange(12))
+    assert apart["trajectory/rpe_translation_m"] is None and apart["trajectory/ate_sim3_m"] > 0
+    with pytest.raises(DegenerateTrajectoryError, match="no two frames with a pose follow each other"):
+        rpe(estimate, truth, 2 * np.arange(12))

@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from emgs_jax.io.files import FrameLog, atomic_write, jsonable, owned, remove_temporaries, write_json
+from emgs_jax.io.files import FrameLog, atomic_write, jsonable, new_folder, owned, remove_temporaries, write_json
 from emgs_jax.io.ply import save_points_ply
 
 
@@ -48,6 +48,23 @@ def test_a_folder_is_held_by_one_program_at_a_time_and_let_go_when_it_dies(tmp_p
         assert os.listdir(folder) == []
     with owned(folder):  # once more, after it was let go
         pass
+
+
+def test_a_new_folder_is_made_by_one_program_at_a_time_and_after_one_that_was_killed(tmp_path):
+    """Two merges into one folder deleted each other's files."""
+    with new_folder(tmp_path / "out") as first:
+        (first / "map.npz").write_text("first")
+        with pytest.raises(ValueError, match="another program is writing into"), new_folder(tmp_path / "out"):
+            pass
+        assert (first / "map.npz").read_text() == "first"
+    with pytest.raises(ValueError, match="out is there already"), new_folder(tmp_path / "out"):
+        pass
+    assert (tmp_path / "out/map.npz").read_text() == "first"
+    (tmp_path / ".other.partial/below").mkdir(parents=True)
+    (tmp_path / ".other.partial/old").write_text("of a program that was killed")
+    with new_folder(tmp_path / "other") as folder:
+        assert not [*folder.iterdir()]
+    assert sorted(os.listdir(tmp_path)) == ["other", "out"]
 
 
 def test_every_line_of_the_frame_log_is_on_disk_at_once_and_a_cut_one_is_taken_back(tmp_path):

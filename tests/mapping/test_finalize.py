@@ -15,7 +15,9 @@ from scene import flat_gaussians, pose, random_gaussians, random_observation, sl
 
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.io.run_lengths import from_run_lengths, to_run_lengths
+from emgs_jax.mapping import integrate
 from emgs_jax.mapping.atlas import Submap
+from emgs_jax.mapping.event import Event
 from emgs_jax.mapping.finalize import own_covariance, with_first_frame
 from emgs_jax.mapping.pipeline import finish_run, with_atlas, with_looks_ended, with_outcome
 from emgs_jax.mapping.records import FrameRecord, to_line
@@ -121,7 +123,7 @@ def test_poses_in_a_saved_map_are_not_relative_to_a_first_frame():
     assert with_first_frame(atlas, np.eye(4)) == (atlas, None)
 
 
-def test_what_the_last_frames_saw_move_is_taken_out_of_the_map_and_written_into_their_records():
+def test_what_the_last_frames_saw_move_is_taken_out_of_the_map_and_written_into_their_records(monkeypatch):
     """The second frame of four has seen something move in a quarter of its pixels, as later ones have shown."""
     config = slam_config("slam.observation.thin=1", "slam.motion.num_looks=3", "slam/existence=default")
     camera, depth = Camera([20.0, 20.0], [7.5, 5.5], 16, 12), 2.0
@@ -148,7 +150,7 @@ def test_what_the_last_frames_saw_move_is_taken_out_of_the_map_and_written_into_
     run = replace(run, atlas=replace(run.atlas, camera=camera))
     oldest = as_seen(jax.tree.map(lambda leaf: leaf[2], looks), state.T_world_previous, jnp.asarray(0.01))
     info = SimpleNamespace(seen=jax.device_get(oldest), moving=np.zeros((12, 16), bool))
-    outcome = with_outcome(run, run.atlas, SimpleNamespace(info=info))
+    outcome = with_outcome(run, run.atlas, SimpleNamespace(info=info, seen=[]))
     assert [record.moving for record in outcome.records] == [0.0, 0.5, 0.0, 0.0], "as a step says it that ends this"
     after = with_looks_ended(run, 6)  # of the record of the last frame
     settings = config.existence
@@ -160,6 +162,22 @@ def test_what_the_last_frames_saw_move_is_taken_out_of_the_map_and_written_into_
     np.testing.assert_array_equal(mask, ((columns < 4) | (columns >= 12)).reshape(12, 16))
     assert after.state.looks is None
     assert with_looks_ended(after, 6).records == after.records
+    apart = replace(run.atlas, submaps={**run.atlas.submaps, 1: Submap(replace(state, looks=None))})
+    apart = replace(run, atlas=replace(apart, graph=replace(apart.graph, active=1)))
+    left = with_looks_ended(apart, 6)  # a submap that the run has left counts, too
+    np.testing.assert_allclose(left.atlas.submaps[0].state.map.existence, expected, rtol=1e-6)
+    assert left.records == after.records and left.atlas.submaps[0].state.looks is None
+    frozen = replace(run.atlas, submaps={0: replace(run.atlas.submaps[0], is_frozen=True)})
+    still = with_looks_ended(replace(run, atlas=frozen), 6)
+    np.testing.assert_array_equal(still.map.existence, map.existence)
+    joined = with_outcome(run, run.atlas, SimpleNamespace(info=None, seen=[jax.device_get(oldest)]))
+    assert joined.records == outcome.records
+    found = SimpleNamespace(submap=0)
+    monkeypatch.setattr(integrate, "place", lambda atlas, window: (atlas, Event(np.eye(4)[None]), found))
+    monkeypatch.setattr(integrate, "update_graph", lambda atlas, *_: atlas)
+    atlas, event = integrate.integrate(apart.atlas, SimpleNamespace(seconds={}))  # a frame of 1 is found in 0
+    np.testing.assert_allclose(atlas.submaps[0].state.map.existence, expected, rtol=1e-6)
+    assert sorted(int(seen.time) for seen in event.seen) == [4, 5] and atlas.submaps[0].state.looks is None
 
 
 def test_how_far_the_last_frame_sees_is_said_by_its_valid_points_alone():

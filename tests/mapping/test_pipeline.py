@@ -16,7 +16,7 @@ from emgs_jax.data.spool import Spool
 from emgs_jax.device.clock import Clock
 from emgs_jax.mapping import pipeline
 from emgs_jax.mapping.pipeline import finish_run, map_frames
-from emgs_jax.mapping.run import clamped, new_run
+from emgs_jax.mapping.run import check_settings, clamped, new_run
 from emgs_jax.mapping.window_input import predictions, window_inputs
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import Prior
@@ -156,11 +156,17 @@ def test_a_prior_without_any_point_is_an_error_and_not_a_run_that_never_maps():
         map_tiny(dataset(), EditedPrior(lambda prediction: replace(prediction, mask=prediction.mask & False)))
 
 
-def test_gaussians_that_are_larger_than_the_image_are_refused_by_their_key(monkeypatch):
+def test_a_map_that_begins_without_a_gaussian_names_the_frame_and_the_points(monkeypatch):
     """A map without a Gaussian was said to be of a prior without a point."""
     monkeypatch.setattr(pipeline, "prepare_step", lambda *_: None)  # of a step, which there is not
-    with pytest.raises(ValueError, match=r"of \d{3,} valid points .*slam\.fit\.points_per_gaussian=1000000"):
-        map_tiny(dataset(), EditedPrior(), "slam.fit.points_per_gaussian=1000000")
+
+    def with_few(prediction):
+        few = np.zeros(prediction.mask.shape[1:], bool)
+        few[[20, 20, 21], [20, 21, 20]] = True  # a Gaussian takes four
+        return replace(prediction, mask=prediction.mask & few)
+
+    with pytest.raises(ValueError, match=r"of 3 valid points none become a Gaussian; begin elsewhere"):
+        map_tiny(dataset(), EditedPrior(with_few))
 
 
 def test_a_sequence_without_frames_is_refused():
@@ -226,3 +232,41 @@ def test_a_setting_that_images_of_this_size_bound_is_named(given, is_said):
         Camera([150.0] * 2, [79.5, 59.5], 640, 480),
     )
     assert "num_candidates=8" in both
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["slam/existence=default", "slam.existence.max_log_odds=0"], "no Gaussian would ever be confirmed"),
+        (["slam/existence=default", "slam.existence.hit=0"], "no Gaussian would ever be confirmed"),
+        (["slam/existence=paper", "slam.existence.birth=0"], "no Gaussian would ever be confirmed"),
+        (
+            ["slam.existence.birth=1", "slam.existence.miss=.1", "slam.existence.max_log_odds=0"],
+            "would ever be confirmed",
+        ),
+        (["slam/existence=default", "slam.existence.refuted=.6"], "every Gaussian would be removed"),
+        (["slam/existence=paper", "slam.existence.refuted=1.5"], "every Gaussian would be removed"),
+        (["slam/motion=default", "slam.motion.prior=-inf"], "taken for moving, and no frame be tracked"),
+        (["slam/motion=default", "slam.motion.prior=-2"], "taken for moving, and no frame be tracked"),
+        (["slam.fit.points_per_gaussian=203057"], "makes no Gaussian of an image"),
+    ],
+)
+def test_settings_by_which_nothing_could_be_tracked_are_refused_with_the_reason(words, message):
+    """Symptom: all frames after the first were lost, and nothing said why."""
+    with pytest.raises(ValueError, match=message):
+        check_settings(slam_config(*words))
+
+
+@pytest.mark.parametrize(
+    "words",
+    [
+        [],
+        ["slam/existence=paper", "slam.existence.max_log_odds=0"],  # as printed, where the log-odds never change
+        ["slam/existence=default", "slam/motion=default"],
+        ["slam.motion.prior=-inf"],  # where nothing is looked for
+        ["slam/motion=default", "slam.motion.prior=-1"],
+        ["slam.fit.points_per_gaussian=203056"],
+    ],
+)
+def test_settings_by_which_frames_are_tracked_are_taken(words):
+    check_settings(slam_config(*words))

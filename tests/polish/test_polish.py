@@ -350,8 +350,30 @@ def test_a_run_can_end_with_it_and_says_at_once_that_optax_is_missing(exact_run,
     assert not (tmp_path / "without" / "map.npz").exists()
 
 
+def test_a_held_out_frame_that_the_map_does_not_cover_is_counted_and_left_out(folder):
+    """Symptom: the PSNR was nan."""
+    before = polish_run(config(*SHORT, folder=shutil.copytree(folder, folder.parent / "other")))
+    lines = (folder / "trajectory.txt").read_text().splitlines()
+    rows = [row for row, line in enumerate(lines) if line and not line.startswith("#")]
+    time = lines[rows[3]].split()[0]
+    lines[rows[3]] = f"{time} 0 0 500 0 0 0 1"  # held out, and looks away from everything
+    (folder / "trajectory.txt").write_text("\n".join(lines) + "\n")
+    found = polish_run(config(*SHORT, folder=folder))
+    assert found["polish/num_covered"] == 1 and found["polish/num_held_out"] == before["polish/num_covered"] == 2
+    assert np.isfinite(found["polish/before_psnr_db"]) and np.isfinite(found["polish/after_psnr_db"])
+    assert "splats; of the 1 that the map covers of 2 frames that were not fitted" in polish_lines(found)[0]
+
+
+def test_a_run_of_one_frame_is_not_polished_and_says_why(tmp_path, capsys):
+    """Symptom: it ended in an error after all was mapped, without a report."""
+    run(compose("prior.level=0", "dataset.stop=1", *SHORT, "polish=default"), tmp_path / "one")
+    said = "".join(capsys.readouterr())
+    assert "not polished: " in said and "has 1 placed frames, of which polishing fits some and compares" in said
+    assert (tmp_path / "one/report.html").is_file() and not (tmp_path / "one/polish.json").exists()
+
+
 def test_splats_that_look_worse_than_the_map_are_named():
     """Of five frames metres apart of TUM's cabinet: 19.0 dB in the map, 11.8 in the splats."""
-    numbers = {"polish/num_splats": 9, "polish/num_held_out": 1, "polish/before_psnr_db": 19.0}
+    numbers = {"polish/num_splats": 9, "polish/num_held_out": 1, "polish/num_covered": 1, "polish/before_psnr_db": 19.0}
     worse, better = (polish_lines(numbers | {"polish/after_psnr_db": value}) for value in (11.8, 30.0))
     assert "too far apart" in worse[-1] and "too far" not in "".join(better)

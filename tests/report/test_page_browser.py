@@ -232,6 +232,29 @@ def test_a_click_on_the_strip_goes_to_that_frame(page, run):
     assert page.run("return document.getElementById('rendered').naturalWidth") > 0
 
 
+def test_a_frame_that_is_not_placed_has_a_picture_and_no_place(page, run):
+    """Symptom: its camera was drawn at a guess, as if it were known."""
+    page.run("report.showFrame(4)")
+    before = page.run("return report.state.view.position")
+    page.run("report.showFrame(3)")
+    assert page.run("return [report.state.frame, report.state.view.position]") == [3, before]
+    cameras = """
+    const found = [], {segment, dot} = report.overlay;
+    report.state.atFrame = false;
+    report.state.paths = {};
+    report.draw(1);
+    const drawn = (row) => {
+      let count = 0;
+      report.overlay.segment = () => count++;
+      report.overlay.dot = () => count++;
+      report.overlay.camera(row, (p) => p.slice(0, 2), report.state.view);
+      return count;
+    };
+    return [drawn(3), drawn(4)];
+    """
+    assert page.run(cameras) == [0, 9]
+
+
 def test_the_ruler_measures_between_two_clicks(page):
     """Both on the near wall, 1 m away, seen from the camera of frame 0: pixels over the focal length are metres."""
     page.run("report.showFrame(0); document.getElementById('ruler').click()")

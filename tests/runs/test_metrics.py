@@ -1,6 +1,7 @@
 """metrics.json of runs that are made by hand; oracles: similarities that are known, counts and times by hand."""
 
 import dataclasses
+from dataclasses import replace
 from types import SimpleNamespace
 
 import equinox as eqx
@@ -17,6 +18,7 @@ from emgs_jax.evaluation.clouds import PointCloud, transform_cloud
 from emgs_jax.evaluation.reconstruction import compare_clouds, reference
 from emgs_jax.evaluation.segmentation import LabelledPoints
 from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.report.printout import why_no_errors
 from emgs_jax.runs.gathering import RawPrior
 from emgs_jax.runs.metrics import Scorer, describe, new_scorer, score_map, score_prior, seconds_per_frame, spent
 
@@ -252,3 +254,24 @@ def test_seconds_a_frame_are_those_of_steps_that_compiled_nothing():
     metrics = spent(SimpleNamespace(phases={"map": 3.0}, compile_seconds=2.0, total_seconds=7.0))
     assert metrics.pop("memory/peak_mb") > 10
     assert metrics == {"time/map_seconds": 3.0, "time/compile_seconds": 2.0, "time/total_seconds": 7.0}
+
+
+def test_a_run_of_which_no_frame_with_a_true_pose_is_placed_says_so():
+    """Symptom: it said that there is no ground truth."""
+    scene = Scene()
+    run = scene.run()
+    run.records = [replace(record, status="lost") for record in run.records]
+    metrics = scene.score(run)
+    assert metrics == {"trajectory/placed_percent": 0.0}
+    assert why_no_errors(metrics) == "no placed frame has a true pose, so no errors"
+    run.true_poses = [None] * NUM_FRAMES
+    assert scene.score(run) == {} and why_no_errors({}) == "no ground truth, so no errors"
+
+
+def test_motions_over_frames_that_are_not_placed_do_not_count():
+    scene = Scene()
+    run = scene.run()
+    whole = scene.score(run)["trajectory/rpe_translation_m"]
+    for pose in run.poses[LOST + 1 :]:
+        pose[0, 3] += 5.0  # a jump where one frame is lost
+    assert scene.score(run)["trajectory/rpe_translation_m"] < whole + 1e-6

@@ -27,6 +27,7 @@ from tqdm import tqdm
 from emgs_jax.config.configure import compose, groups
 from emgs_jax.config.overrides import parsed, readable
 from emgs_jax.io.files import owned
+from emgs_jax.sequence import load_config
 from experiments.cli import COMMANDS, main
 from experiments.command import (
     check_arguments,
@@ -70,6 +71,45 @@ def test_an_override_that_names_nothing_is_one_line_with_what_was_perhaps_meant(
     with pytest.raises(ValueError, match=message) as caught:
         compose(*overrides)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("word", "near"),
+    [
+        ("+foo=1", "near names: "),
+        ("++foo=1", "near names: "),
+        ("+featurs.text=a", "near names: .*features"),
+        ("+features.txt=a", "near names: features.text"),
+        ("+graph.max_known=1", "near names: "),
+        ("+slam.window_sizes=3", "near names: slam.window_size"),
+        ("+slam.em.nosie=3", r"near names: slam\.em\.noise"),
+        ("+densify.render.opacty=.3", r"near names: .*render\.opacity"),
+        ("+map.foo=1", "near names: "),
+    ],
+)
+def test_a_key_that_is_added_and_that_nobody_reads_is_refused(word, near):
+    """Symptom: `emgs run +foo=1` was taken without a word."""
+    with pytest.raises(
+        ValueError, match=rf"^{re.escape(word)} would have no effect: .* is no key of the config; {near}"
+    ):
+        check_arguments("config", [word])
+    with pytest.raises(ValueError, match="would have no effect"):
+        load_config(word)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("config", ["prior=multiview_stereo", "+prior.structure.options.extraction.max_num_features=99"]),
+        ("config", ["++slam.em.noise=.1"]),
+        ("config", ["+hydra.job.name=x"]),
+        ("config", ["+baseline.mine={_target_:x}"]),
+        ("evaluate", ["suite=smoke", "+variants.wide={slam.window_size:7}"]),
+        ("evaluate", ["suite=smoke", "+tolerances.x={direction:lower,tolerance:.1}"]),
+    ],
+)
+def test_a_key_that_is_added_where_any_name_may_stand_is_taken(name, words):
+    check_arguments(name, words)
 
 
 def test_a_word_in_the_place_of_a_group_is_an_error_for_every_group():

@@ -96,6 +96,19 @@ def test_lines_in_any_order_have_the_errors_of_those_in_order_of_time(tmp_path, 
     np.testing.assert_allclose(found[1], found[0], rtol=1e-9)
 
 
+def test_a_motion_over_frames_without_a_pose_does_not_count(tmp_path, truth):
+    """As in metrics.json of a run: a gap is no step."""
+    times, poses, cloud = truth
+    rows, found = [0, 1, 3, 4, 5], []
+    for jump in (0.0, 5.0):
+        moved = poses.copy()
+        moved[3:, 0, 3] += jump
+        (tmp_path / str(jump)).mkdir()
+        trajectory, _, out = write_system(tmp_path / str(jump), times[rows], moved[rows], cloud)
+        found.append(scored(trajectory, out)[0]["trajectory/rpe_translation_m"])
+    assert found[1] == pytest.approx(found[0], rel=1e-6)
+
+
 @pytest.mark.parametrize(("matched", "warns"), [(18, False), (17, True)])
 def test_a_system_that_knows_less_than_the_wanted_share_of_the_frames_is_warned_of(matched, warns):
     text = coverage({"trajectory/num_frames": matched, "score/num_poses": 40, "score/num_frames": 20}, 90)

@@ -12,6 +12,7 @@ from emgs_jax.structure import sequence
 from emgs_jax.structure.given import given_models
 from emgs_jax.structure.model import stem, to_structure
 from emgs_jax.structure.reconstruct import Shots
+from emgs_jax.structure.uncertainty import camera_in_world
 
 NUM, SIZE, FOCAL = 8, (640, 480), 500.0
 
@@ -140,3 +141,72 @@ def test_the_camera_that_is_estimated_is_of_the_images_in_use(tmp_path, monkeypa
         pictures = Pictures(SIZE, len(used), lambda _: np.zeros((480, 640, 3), np.uint8))
         camera, about = sequence.calibrate(pictures, replace(structure_config(), model=str(tmp_path)))
         assert camera.intrinsics[0] == FOCAL * (1 + number) and about["num_images"] == len(used)
+
+
+def named(model, name):
+    for number, image in enumerate(sorted(model.images.values(), key=lambda one: one.name)):
+        image.name = name.format(number)
+    return model
+
+
+def radial(model):
+    """The camera bends a little; its images are taken as they are, so points no longer fall on their keypoints."""
+    for camera in model.cameras.values():
+        camera.model, camera.params = pycolmap.CameraModelId.SIMPLE_RADIAL, [FOCAL, 320.0, 240.0, -0.01]
+    return model
+
+
+def lacking(model, rows):
+    for image in [image for number, image in enumerate(by_name(model)) if number in rows]:
+        model.deregister_frame(image.frame_id)
+    return model
+
+
+def by_name(model):
+    return sorted(model.images.values(), key=lambda one: one.name)
+
+
+def written(models, place, as_text=False):
+    for number, model in enumerate(models):
+        folder = place / str(number) if len(models) > 1 else place
+        folder.mkdir(parents=True, exist_ok=True)
+        model.write_text(folder) if as_text else model.write_binary(folder)
+    return place
+
+
+# What a user brings; which frames have a pose in it, and the names of this run's images.
+SITUATIONS = {
+    "binary": (lambda p: written([scene()], p), range(NUM), None),
+    "text": (lambda p: written([scene()], p, as_text=True), range(NUM), None),
+    "names in folders": (lambda p: written([named(scene(), "cam/left/{:03d}.JPG")], p), range(NUM), "{:03d}"),
+    "names with points": (lambda p: written([named(scene(), "170.{:03d}.png")], p), range(NUM), "170.{:03d}"),
+    "names without ends": (lambda p: written([named(scene(), "f{:03d}")], p), range(NUM), "f{:03d}"),
+    "images missing": (lambda p: written([lacking(scene(), (0, 5))], p), (1, 2, 3, 4, 6, 7), None),
+    "a bent camera": (lambda p: written([radial(scene())], p), range(NUM), None),
+    "several models": (
+        lambda p: written([lacking(scene(), (5, 6, 7)), lacking(scene(), range(5))], p, as_text=True),
+        range(NUM),
+        None,
+    ),
+}
+
+
+@pytest.mark.parametrize("size", [SIZE, (320, 240), (1280, 960)])
+@pytest.mark.parametrize("kind", SITUATIONS)
+def test_a_model_keeps_its_poses_its_world_its_unit_and_its_camera(tmp_path, capsys, kind, size):
+    """Right, whatever the files, names and sizes: poses as they are, no pose where there is none, its own camera."""
+    write, placed, name = SITUATIONS[kind]
+    truth = np.array([camera_in_world(image) for image in by_name(scene())])
+    names = names_of(scene()) if name is None else [name.format(row) for row in range(NUM)]
+    config = replace(structure_config(), model=str(write(tmp_path / "model")))
+    models = given_models(tmp_path / "model", taken(names, size), config)
+    found = to_structure(models, names, config)
+    assert np.flatnonzero(found.is_placed).tolist() == [*placed]
+    rows = [*placed]
+    np.testing.assert_allclose(found.T_world_camera[rows], truth[rows], atol=1e-9)
+    assert "its unit stays" in "".join(capsys.readouterr())
+    for world in found.worlds:
+        lens = [FOCAL, 320, 240] if kind == "a bent camera" else [FOCAL, FOCAL, 320, 240]
+        np.testing.assert_allclose(world.camera.params[: len(lens)], np.array(lens) * size[0] / SIZE[0])
+        assert (world.camera.width, world.camera.height) == size
+    assert len(found.worlds) == (2 if kind == "several models" else 1)

@@ -109,6 +109,16 @@ def viewer(run):
     viewer.stop()
 
 
+def test_a_frame_that_is_not_placed_has_no_camera(viewer):
+    """Symptom: it stood at a guess, as if it were known."""
+    lost = [line["status"] for line in viewer._run.frames].index("lost")
+    assert lost not in viewer.scene.frustums and len(viewer.scene.frustums) == len(viewer._run.frames) - 1
+    for row in (lost, lost + 1):
+        viewer.frame.value = row
+        viewer._choose()
+        assert viewer.scene.chosen.visible == (row != lost)
+
+
 def test_the_field_of_view_is_the_angle_between_the_upper_and_the_lower_edge_of_the_image():
     assert np.isclose(field_of_view(Camera((1.0, 50.0), (0.0, 0.0), 30, 100)), np.pi / 2)
 

@@ -44,11 +44,20 @@ from emgs_jax.prior.files.layouts import (
 from emgs_jax.prior.files.naming import rows_of
 from emgs_jax.prior.files.own import GIVES_POSES, read_own
 from emgs_jax.prior.files.pose_error import pose_angle
-from emgs_jax.prior.files.view import Camera, Intrinsics, Predictions, View, at_frame, by_rays, grid_intrinsics, usable
+from emgs_jax.prior.files.view import (
+    Camera,
+    Intrinsics,
+    Predictions,
+    View,
+    at_frame,
+    by_rays,
+    check_metres,
+    grid_intrinsics,
+    usable,
+)
 
 AUTO = "auto"
 SCALES = ("auto", "metric", "arbitrary")
-ROOM = (0.05, 100.0)  # m, median depth of a view that is metric
 TURNS = {3: [[-1, 0], [0, -1]], 6: [[0, 1], [-1, 0]], 8: [[0, -1], [1, 0]]}  # R_stored_shown of an EXIF orientation
 FOCAL_NOTE, FOCAL_ERROR = 1.03, 1.5  # ratio of the files' focal length and the data set's
 NUM_CAMERAS = 16  # views whose intrinsics are looked at for the camera of the images
@@ -108,11 +117,9 @@ class Files(Prior):
         known = [index for index, row in enumerate(self._rows) if row is not None]
         camera = Camera((dataset.size[0], dataset.size[1]), dataset.intrinsics)
         view, depth = self._first_depth()
-        if self._is_metric and not ROOM[0] <= depth <= ROOM[1]:
-            raise ValueError(
-                f"{view.source} has a median of {depth:.4g}, which is no depth in metres: write metres, give "
-                "prior.depth_scale (units of a metre in .png files; 1000: mm), or prior.scale=arbitrary"
-            )
+        if self._is_metric:
+            remedies = "write metres, give prior.depth_scale (units of a metre in .png files; 1000: mm), or"
+            check_metres(depth, view.source, f"{remedies} prior.scale=arbitrary")
         turned = turned_files(dataset)
         poses = {index: self._pose(index) for index in known}
         poses = {index: pose for index, pose in poses.items() if np.isfinite(pose).all()}

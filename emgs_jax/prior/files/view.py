@@ -16,6 +16,7 @@ from emgs_jax.prior.network.resize import at_pixels, on_grid_of
 Intrinsics = tuple[float, float, float, float]
 MAX_ASPECT_ERROR = 0.05  # of what shows a whole image: networks round a side to whole patches
 LEAST_DEPTH = 1e-6  # below: no value
+ROOM = 0.05, 100.0  # m, median depth of a view that is metric
 
 
 @dataclass(frozen=True)
@@ -70,6 +71,12 @@ class Predictions:
     place: Place  # the part of the image that grids show
     may_lack: bool = False  # frames without a view are allowed
     unread: tuple[str, ...] = ()  # arrays of the first file that are not used
+
+
+def check_metres(depth: float, source: str, remedies: str) -> None:
+    """Raise ValueError, with `remedies`, if a view's median depth is none in metres."""
+    if not ROOM[0] <= depth <= ROOM[1]:
+        raise ValueError(f"{source} has a median of {depth:.4g}, which is no depth in metres: {remedies}")
 
 
 def whole_image(camera: Camera, view: View) -> Part:

@@ -19,7 +19,7 @@ from emgs_jax.data.reading import check_depth_scale, decode, fingerprint
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.files.arrays import files_of, load_exr, load_npy, load_npz, names_in
 from emgs_jax.prior.files.naming import rows_of
-from emgs_jax.prior.files.view import Camera, View, whole_image
+from emgs_jax.prior.files.view import Camera, View, check_metres, whole_image
 from emgs_jax.prior.multiview.dense import Depths, Scene, Way
 from emgs_jax.prior.multiview.lens import rectify
 from emgs_jax.prior.multiview.monocular import MonocularConfig, begin_monocular
@@ -27,6 +27,10 @@ from emgs_jax.structure.model import Structure
 
 SUFFIXES = (".npz", ".npy", ".pfm", ".exr", ".png")  # the first that exists is read
 KEYS = ("depth", "depths", "disparity", "disparities", "inverse_depth", "prediction")  # of an .npz with several arrays
+IN_METRES = (
+    "write metres (RealSense, ARKit and others write millimetres), give prior.dense.depth_scale (units of a metre in "
+    ".png files), or prior.dense.kind=up_to_scale"
+)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -51,7 +55,9 @@ def way_of_files(config: DepthFilesConfig) -> Way:
     found = open_depths(folder, config.kind, check_depth_scale(config.depth_scale, "prior.dense.depth_scale"))
 
     def check(dataset: Dataset) -> None:
-        _reader(dataset, found, folder)(0)
+        values = _reader(dataset, found, folder)(0)
+        if config.kind == "metric" and np.isfinite(values).any():
+            check_metres(float(np.nanmedian(values)), str(found.files[0]), IN_METRES)
 
     def begin(scene: Scene) -> tuple[Structure, Depths]:
         read = _reader(scene.dataset, found, folder)

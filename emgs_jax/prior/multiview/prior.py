@@ -19,6 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame, wait_for_all
+from emgs_jax.data.masks import check_names
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
@@ -33,6 +34,7 @@ from emgs_jax.prior.multiview.monocular_network import MeterConfig, way_of_meter
 from emgs_jax.prior.multiview.swept import SweptConfig, swept
 from emgs_jax.prior.sources import placed_beside, sources_of
 from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.given import names_at
 from emgs_jax.structure.model import NONE, Structure
 from emgs_jax.structure.sequence import structure_of
 
@@ -128,6 +130,9 @@ class MultiviewStereo(Prior):
             return
         if self._dataset is None:
             raise ValueError("multiview_stereo makes a structure of a data set: call check(dataset, window_size) first")
+        if self._config.model is not None:
+            names = names_at(Path(self._config.model).expanduser())
+            check_names(self._dataset, names, f"prior.structure.model={self._config.model}")
         (width, height), intrinsics = self._dataset.size, self._dataset.intrinsics
         self._camera = Camera(np.float32(intrinsics[:2]), np.float32(intrinsics[2:]), width, height)
         found, is_straight = structure_of(self._dataset, self._config, self._folder)

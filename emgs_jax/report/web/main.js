@@ -95,7 +95,7 @@ function wireDrawing(report) {
   };
   report.showFrame = (row, goesThere = true) => {
     showPictures(report, row);
-    if (goesThere) {
+    if (goesThere && Number.isFinite(poseAt(arrays.poses, row).position[0])) {
       state.atFrame = true;
       state.view = poseAt(arrays.poses, row);
       state.pivot = add(state.view.position, mul(state.view.ahead, 0.25 * state.size));

@@ -51,26 +51,28 @@ class Overlay {
   }
 
   path(poses, color, width) {
-    let before = null;
+    let before = null, isGap = false; // of frames that are not placed: dots from the one before to the one after
     for (let row = 0; row < poses.length / 12; row++) {
       const here = poseAt(poses, row).position;
       const isKnown = Number.isFinite(here[0]);
-      const isLost = poses === this.arrays.poses && ["lost", "apart"].includes(ABOUT.frames.status[row]);
-      const look = isLost ? ["#e5484d", 1, [3, 6]] : [color, width];
-      if (before && isKnown) this.segment(before, here, ...look);
-      before = isKnown ? here : null;
+      const isOurs = poses === this.arrays.poses, look = isGap ? ["#e5484d", 1, [3, 6]] : [color, width];
+      if (before && isKnown && (isOurs || !isGap)) this.segment(before, here, ...look);
+      before = isKnown ? here : before;
+      isGap = !isKnown;
     }
   }
 
   loops() {
     const place = (row) => poseAt(this.arrays.poses, row).position;
     for (const [frame, other, outcome] of ABOUT.loops)
-      if (outcome === "accepted") this.segment(place(frame), place(other), ABOUT.paths.loops, 1);
+      if (outcome === "accepted" && [frame, other].every((row) => Number.isFinite(place(row)[0])))
+        this.segment(place(frame), place(other), ABOUT.paths.loops, 1);
   }
 
   // The chosen frame's camera as a pyramid of a twentieth of the map's size, with its image at the far side.
   camera(frame, pixel, view) {
     const pose = poseAt(this.arrays.poses, frame);
+    if (!Number.isFinite(pose.position[0])) return; // not placed
     const { fx, fy, cx, cy, width, height } = ABOUT.camera, far = 0.06 * this.state.size;
     const at = (x, y) => toWorld(pose, mul([(x - cx) / fx, (y - cy) / fy, 1], far));
     this.image((x, y) => toCamera(view, at(x * width, y * height)), pixel);

@@ -195,6 +195,26 @@ def test_depths_of_the_room_come_back_in_the_unit_of_the_structure_or_in_metres(
         assert std[is_known].max() < 0.1
 
 
+@pytest.mark.parametrize(
+    ("kind", "unit", "is_refused"), [("metric", 1, False), ("metric", 1000, True), ("affine", 1000, False)]
+)
+def test_metric_depths_in_millimetres_are_refused_at_once_by_the_key_that_tells_their_unit(
+    tmp_path, kind, unit, is_refused
+):
+    """Symptom: after the structure was made, an error advised another prior."""
+    drawn, _, _, frames = room()
+    for index, frame in enumerate(frames):
+        np.save(tmp_path / f"{index:03d}.npy", np.uint16(np.rint(unit * (frame.depth + 1))))
+    check = way_of_files(config(tmp_path, kind)).check
+    if not is_refused:
+        check(drawn)
+        return
+    with pytest.raises(
+        ValueError, match=r"000.npy has a median of 3\d\d\d, .* write metres .*prior\.dense\.depth_scale"
+    ):
+        check(drawn)
+
+
 def test_a_landmark_is_as_uncertain_as_its_parallax_says():
     """σ of log z is σ_px z / (f b) of a view at a baseline b across, the frame's own says nothing."""
     _, found, camera, _ = room()
