@@ -39,7 +39,7 @@ def main(folder: str, fps: str) -> None:
         said = CameraInfo(width=64, height=48, distortion_model="plumb_bob", d=[0.0] * 5)
         fx, fy, cx, cy = given["intrinsics"]
         said.k = [fx, 0.0, cx, 0.0, fy, cy, 0.0, 0.0, 1.0]
-        said.header.stamp = now
+        said.header.stamp, said.header.frame_id = now, "camera"
         info.publish(said)
         pose = Odometry(child_frame_id="camera")
         pose.header.stamp, pose.header.frame_id = now, "odom"

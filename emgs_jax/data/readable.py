@@ -50,6 +50,8 @@ class ReadableFrames:
         self.every = getattr(dataset, "every", ())
         self.full_intrinsics = getattr(dataset, "full_intrinsics", None)
         self._grows, indices = dataset.total is None, range(len(dataset))
+        if self._grows and masks.folder is not None:
+            raise ValueError(f"masks.folder={masks.folder} cannot have masks of images that are still to come")
         may_skip = on_bad_frame == "skip"
         self._masks, self._mask_files = masks, self._files_of_masks(dataset, masks, may_skip)
         self.has_masks = any(self._mask_files)

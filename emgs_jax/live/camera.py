@@ -67,7 +67,7 @@ class Camera(Straightened):
             raise ValueError(NO_INTRINSICS)
         shot = self._newest.take(FIRST_S)
         if shot is None:
-            raise ValueError(self._newest.reason or f"camera {self.source} gives no image in {FIRST_S:g} s")
+            raise ValueError(self._newest.reason or self._said(f"gives no image in {FIRST_S:g} s"))
         self._begin, self._raw_size = shot.arrived, shot.image.shape[1::-1]
         self.size = about_pixels(*self._raw_size) if self.size is None else self.size
         self._lens = None
@@ -79,6 +79,11 @@ class Camera(Straightened):
         self._use(find_lens(self._given, pictures), self._raw_size, f"{as_words(self._raw_size)}, {name}")
         if not self._images:
             self._add(shot)
+
+    def _said(self, words: str) -> str:
+        """What the camera does, with the last problem of its images."""
+        problem = self._newest.problem
+        return f"camera {self.source} {words}" + (f": {problem}" if problem else "")
 
     def _new_folder(self) -> Path:
         if not self.record:
@@ -132,7 +137,7 @@ class Camera(Straightened):
                 return None
             shot = self._newest.take(NEXT_S)
             if shot is None:
-                self._newest.end(f"camera {self.source} has given none for {NEXT_S:g} s")
+                self._newest.end(self._said(f"has given none for {NEXT_S:g} s"))
                 return None
             if shot.image.shape[1::-1] != self._raw_size:
                 was, now = as_words(self._raw_size), as_words(shot.image.shape[1::-1])

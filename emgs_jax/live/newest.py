@@ -32,11 +32,12 @@ class Newest:
     Attributes:
         num_dropped: images that came and were not taken.
         reason: why no more will come; None while they may.
+        problem: why the last one that could not be read could not; None if there was none.
     """
 
     def __init__(self) -> None:
         self._changed, self._shot = threading.Condition(), None
-        self.num_dropped, self.reason = 0, None
+        self.num_dropped, self.reason, self.problem = 0, None, None
         _running.add(self)
 
     def put(self, shot: Shot) -> bool:

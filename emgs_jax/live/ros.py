@@ -60,19 +60,19 @@ def subscribe(words: Sequence[str], into: Newest) -> Calibration | None:
     """
     rclpy = started(words)
     from rclpy.executors import SingleThreadedExecutor
-    from rclpy.qos import qos_profile_sensor_data
+    from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
     from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
     topics = dict(word.split(":=") for word in words)
     node, told = rclpy.create_node("emgs"), threading.Event()
     kinds = {kind for kind, name in (("depth", "depth"), ("pose", "odometry")) if name in topics}
-    joined, infos = Joined(kinds), []
+    joined, frames, infos = Joined(kinds), Frames(), []
 
     def add(kind: str, message: Any) -> None:
         try:
-            value = READERS[kind](message)
+            value = frames.read(kind, message)
         except (BadFrameError, ValueError) as error:
-            into.end(f"ros: {error}")
+            into.problem = str(error)
             return
         for time_s, found in joined.add(kind, stamp_of(message), value):
             given = {name: found[kind] for kind, name in GIVEN.items() if kind in found}
@@ -92,6 +92,11 @@ def subscribe(words: Sequence[str], into: Newest) -> Calibration | None:
         from nav_msgs.msg import Odometry
 
         node.create_subscription(Odometry, "odometry", partial(add, "pose"), quality)
+        with contextlib.suppress(ImportError):  # not among the wheels of the extra
+            from tf2_msgs.msg import TFMessage
+
+            kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
+            node.create_subscription(TFMessage, "/tf_static", frames.learn, kept)
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     threading.Thread(target=_spin, args=(executor, node, into), name="ros", daemon=True).start()
@@ -139,9 +144,55 @@ def depth_of(message: Any) -> np.ndarray:
 
 
 def pose_of(message: Any) -> np.ndarray:
-    """T_odom_camera (4, 4) of an Odometry whose child frame is the camera's optical frame."""
+    """T_odom_child (4, 4) of an Odometry."""
     place, turn = message.pose.pose.position, message.pose.pose.orientation
     return rigid((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
+
+
+class Frames:
+    """The frames of a robot: what `odometry` moves, and where the camera stands on it."""
+
+    def __init__(self) -> None:
+        self._parents: dict[str, tuple[str, np.ndarray]] = {}  # of a frame, with T_parent_frame
+        self._camera: str | None = None
+
+    def learn(self, message: Any) -> None:
+        """Take the transforms of a TFMessage on /tf_static."""
+        for one in message.transforms:
+            place, turn = one.transform.translation, one.transform.rotation
+            pose = rigid((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
+            self._parents[one.child_frame_id.lstrip("/")] = one.header.frame_id.lstrip("/"), pose
+
+    def read(self, kind: str, message: Any) -> np.ndarray:
+        """Read a message of a kind in `READERS`; poses become those of the camera.
+
+        Raises:
+            ValueError: the odometry is of another frame than the images, and none of /tf_static joins the two.
+        """
+        value = READERS[kind](message)
+        if kind == "image":
+            self._camera = message.header.frame_id.lstrip("/")
+        if kind != "pose" or not self._camera or message.child_frame_id.lstrip("/") == self._camera:
+            return value
+        (camera_root, T_root_camera), (moved_root, T_root_moved) = (
+            self._above(name) for name in (self._camera, message.child_frame_id.lstrip("/"))
+        )
+        if camera_root != moved_root:
+            raise ValueError(
+                f"odometry is of the frame {message.child_frame_id}, images are of {self._camera}, and /tf_static does "
+                "not join them: take the odometry of the camera, or publish where it is mounted"
+            )
+        return value @ np.linalg.inv(T_root_moved) @ T_root_camera
+
+    def _above(self, name: str) -> tuple[str, np.ndarray]:
+        """The last frame above one, and the pose of the latter in it."""
+        pose = np.eye(4)
+        for _ in range(len(self._parents)):
+            if name not in self._parents:
+                break
+            name, step = self._parents[name]
+            pose = step @ pose
+        return name, pose
 
 
 READERS = {"image": image_of, "depth": depth_of, "pose": pose_of}

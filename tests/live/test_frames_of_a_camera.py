@@ -175,11 +175,15 @@ def test_all_cameras_of_the_process_can_be_ended(source):
 
 def test_no_more_images_a_second_are_taken_than_asked_for(source):
     source.give(Shot(0.0, an_image(0)))
-    frames = Camera(source="0", intrinsics=INTRINSICS, fps=5.0)
-    threading.Thread(
-        target=lambda: [(time.sleep(0.02), source.give(Shot(0.1 * n, an_image(n)))) for n in range(1, 60)], daemon=True
-    ).start()
+    frames, is_over = Camera(source="0", intrinsics=INTRINSICS, fps=5.0), threading.Event()
+
+    def give() -> None:
+        while not is_over.wait(0.02):
+            source.give(Shot(time.monotonic(), an_image(1)))
+
+    threading.Thread(target=give, daemon=True).start()
     assert frames.has(4)
+    is_over.set()
     assert (np.diff(frames._arrived) >= 0.2).all()
 
 

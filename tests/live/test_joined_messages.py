@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.live import joined_messages
 from emgs_jax.live.joined_messages import Joined, pose_at
-from emgs_jax.live.ros import depth_of, image_of, pose_of, stamp_of
+from emgs_jax.live.ros import Frames, depth_of, image_of, pose_of, stamp_of
 
 
 def at(x: float, degrees: float = 0.0) -> np.ndarray:
@@ -111,12 +111,57 @@ def test_depths_are_metres_and_0_where_there_is_none(big):
         depth_of(message(RGB, "rgb8"))
 
 
+def transform(T: np.ndarray, **names):
+    """Position and orientation of a pose as a message has them, under these names."""
+    values = dict(zip("xyzw", Rotation.from_matrix(T[:3, :3]).as_quat(), strict=True))
+    place, turn = SimpleNamespace(**dict(zip("xyz", T[:3, 3], strict=True))), SimpleNamespace(**values)
+    return SimpleNamespace(**{names["place"]: place, names["turn"]: turn})
+
+
+def odometry(T: np.ndarray, child: str, time_s: float = 12.25):
+    stamp = SimpleNamespace(sec=int(time_s), nanosec=round(time_s % 1 * 1e9))
+    pose = SimpleNamespace(pose=transform(T, place="position", turn="orientation"))
+    return SimpleNamespace(pose=pose, child_frame_id=child, header=SimpleNamespace(stamp=stamp, frame_id="odom"))
+
+
+def random_pose(seed: int) -> np.ndarray:
+    pose = np.eye(4)
+    pose[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    pose[:3, 3] = np.random.default_rng(seed).normal(size=3)
+    return pose
+
+
 def test_a_pose_and_a_stamp_are_those_of_the_message():
-    turn = Rotation.from_euler("xyz", [10, 20, 30], degrees=True)
-    x, y, z, w = turn.as_quat()
-    place, quaternion = SimpleNamespace(x=1.0, y=2.0, z=3.0), SimpleNamespace(x=x, y=y, z=z, w=w)
-    inner = SimpleNamespace(position=place, orientation=quaternion)
-    stamp = SimpleNamespace(sec=12, nanosec=250_000_000)
-    odometry = SimpleNamespace(pose=SimpleNamespace(pose=inner), header=SimpleNamespace(stamp=stamp))
-    np.testing.assert_allclose(pose_of(odometry)[:3, :3], turn.as_matrix(), atol=1e-12)
-    assert pose_of(odometry)[:3, 3].tolist() == [1, 2, 3] and stamp_of(odometry) == 12.25
+    T = random_pose(0)
+    np.testing.assert_allclose(pose_of(odometry(T, "camera")), T, atol=1e-12)
+    assert stamp_of(odometry(T, "camera")) == 12.25
+
+
+def test_odometry_of_the_base_becomes_that_of_the_camera_where_tf_says_how_it_is_mounted():
+    """Most robots publish the odometry of their base, which is not where the camera is."""
+    frames, T_odom_base, T_base_mast, T_mast_camera = Frames(), *map(random_pose, range(3))
+    image = message(RGB, "rgb8")
+    image.header = SimpleNamespace(frame_id="camera_optical")
+    frames.read("image", image)
+    with pytest.raises(ValueError, match="odometry is of the frame base_link, images are of camera_optical"):
+        frames.read("pose", odometry(T_odom_base, "base_link"))
+    np.testing.assert_allclose(frames.read("pose", odometry(T_odom_base, "camera_optical")), T_odom_base, atol=1e-12)
+    links = [("base_link", "mast", T_base_mast), ("/mast", "/camera_optical", T_mast_camera)]
+    frames.learn(
+        SimpleNamespace(
+            transforms=[
+                SimpleNamespace(
+                    header=SimpleNamespace(frame_id=parent),
+                    child_frame_id=child,
+                    transform=transform(T, place="translation", turn="rotation"),
+                )
+                for parent, child, T in links
+            ]
+        )
+    )
+    expected = T_odom_base @ T_base_mast @ T_mast_camera
+    np.testing.assert_allclose(frames.read("pose", odometry(T_odom_base, "base_link")), expected, atol=1e-12)
+    # Of a frame below the base that is no ancestor of the camera.
+    frames._parents["imu"] = "base_link", random_pose(5)
+    found = frames.read("pose", odometry(T_odom_base @ random_pose(5), "imu"))
+    np.testing.assert_allclose(found, expected, atol=1e-12)

@@ -82,11 +82,9 @@ class Stream(Prior):
 
     def _at_frame(self, path: Path, camera: Camera, is_known: bool) -> DenseView:
         """Points, confidence and mask of a frame; none is valid without a pose."""
-        return (
-            at_frame(read_npz_view(path), camera, whole_image, self._max_depth_step)
-            if is_known
-            else no_points(camera.size)
-        )
+        if not is_known:
+            return no_points(camera.size)
+        return at_frame(read_npz_view(path), camera, whole_image, self._max_depth_step)
 
     def _check_conventions(self, window: Window, pose: np.ndarray, camera: Camera) -> None:
         """Compare the first `NUM_COMPARED` views with a pose, once they are there."""
