@@ -35,9 +35,10 @@ def test_whitening_equals_numpy_from_millimetres_to_decametres(stds):
 
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_a_matrix_that_is_not_positive_counts_as_the_identity(unit):
-    matrices = np.float32([np.zeros((3, 3)), -np.eye(3), np.diag([1.0, 1.0, -1.0])]) * np.float32(unit)
+    mixed = [np.diag(np.roll([1.0, 1.0, -1.0], i)) for i in range(3)]
+    matrices = np.float32([np.zeros((3, 3)), -np.eye(3), *mixed]) * np.float32(unit)
     triangles, logdets = whitening(matrices)
-    np.testing.assert_array_equal(triangles, np.tile(np.eye(3)[np.tril_indices(3)], (3, 1)))
+    np.testing.assert_array_equal(triangles, np.tile(np.eye(3)[np.tril_indices(3)], (len(matrices), 1)))
     np.testing.assert_array_equal(logdets, 0)
     total = lambda m: jnp.sum(linalg.whitening(m)[0])  # noqa: E731
     assert np.isfinite(on_host(jax.grad(total))(matrices)).all()
