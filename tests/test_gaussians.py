@@ -99,6 +99,8 @@ def test_an_image_is_cut_into_as_many_pieces_whatever_its_size(config):
         (130, 98, 2, 4),  # two rows would have no covariance
     ):
         assert spacing(Camera([1.0, 1.0], [0.0, 0.0], width, height), thin, chosen) == expected
+    many = config("slam.fit.points_per_gaussian=100000").fit
+    assert spacing(Camera([1.0, 1.0], [0.0, 0.0], 518, 392), 1, many) == 100000  # to the pixel
 
 
 def test_no_gaussian_spans_a_depth_edge_that_is_larger_than_it(fit_config):

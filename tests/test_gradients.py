@@ -14,7 +14,6 @@ from verbs import CAMERA, CONFIG, NOISE, ROWS, close, looking, map_of
 from emgs_jax import em, surface_extrapolation
 from emgs_jax.ops.pytree import take_rows
 from emgs_jax.registration import icp, problem
-from emgs_jax.render import composite
 
 pytestmark = pytest.mark.slow
 STEP = 1e-6  # of float64, in m, rad and parts
@@ -58,15 +57,6 @@ def continued(given, points, noise, pose, weight):
     return (moved.points,)
 
 
-def drawn(given, means, covs, pose):
-    gaussians, T, config = given
-    gaussians, render = at(gaussians, means=means, covs=covs), config.refinement.render
-    image = composite.render(gaussians, gaussians.colors, turned(T, pose), CAMERA, render)
-    values = jnp.concatenate([image.values.ravel(), image.alpha.ravel(), image.depth.ravel()])
-    weights = np.random.default_rng(1).normal(size=(8, values.shape[0]))
-    return (jnp.asarray(weights, values.dtype) @ values,)
-
-
 def case(name):
     """The function, what is given, and what it is differentiated by."""
     nowhere = np.zeros(6, np.float32)
@@ -78,11 +68,9 @@ def case(name):
         T, prior = sc.path_pose(0), 50.0 * np.eye(7, dtype=np.float32)
         seen = sc.moved_points(sc.pose_of(np.linalg.inv(sc.matrix_of(T))), observation)
         return registered, (seen, gaussians, prior, T, SHARP), [seen.points, nowhere, np.float32(1), np.float32(0.01)]
-    if name == "extrapolation":
-        wide = sc.random_observation(192, 0, 2)
-        weight = np.linspace(1.0, 2.0, 192, dtype=np.float32)
-        return continued, (wide, map, looking(0), SHARP), [wide.points, 0.1 * weight, nowhere, weight]
-    return drawn, (gaussians, looking(0), SHARP), [gaussians.means, gaussians.covs, nowhere]
+    wide = sc.random_observation(192, 0, 2)
+    weight = np.linspace(1.0, 2.0, 192, dtype=np.float32)
+    return continued, (wide, map, looking(0), SHARP), [wide.points, 0.1 * weight, nowhere, weight]
 
 
 def in_float64(function, *arguments):
@@ -100,19 +88,13 @@ def directions_of(inputs):
     rng, one_each = np.random.default_rng(0), []
     for place, given in enumerate(inputs):
         part = rng.uniform(-1, 1, given.shape) * max(np.abs(given).max(), 0.01)
-        part = part + part.mT if given.shape[-2:] == (3, 3) else part
         one_each.append([np.float32(part if i == place else np.zeros_like(x)) for i, x in enumerate(inputs)])
     return [np.stack(parts) for parts in zip(*one_each, strict=True)]
 
 
-def slopes(function, is_reverse):
+def slopes(function):
     def of(given, inputs, directions):
-        call = lambda *inputs: function(given, *inputs)  # noqa: E731
-        if not is_reverse:
-            return jax.vmap(lambda *d: jax.jvp(call, inputs, d)[1])(*directions)
-        rows = jax.jacrev(lambda inputs: call(*inputs)[0])(inputs)
-        along = lambda x, d: jnp.tensordot(d.reshape(len(d), -1), x.reshape(len(x), -1), (1, 1))  # noqa: E731
-        return (sum(along(x, d) for x, d in zip(rows, directions, strict=True)),)
+        return jax.vmap(lambda *d: jax.jvp(lambda *x: function(given, *x), inputs, d)[1])(*directions)
 
     return of
 
@@ -136,15 +118,13 @@ ICP = pytest.mark.xfail(
 )
 
 
-@pytest.mark.parametrize(
-    "name", ["em", pytest.param("icp", marks=[ICP, pytest.mark.weekly]), "extrapolation", "render"]
-)
+@pytest.mark.parametrize("name", ["em", pytest.param("icp", marks=[ICP, pytest.mark.weekly]), "extrapolation"])
 def test_a_derivative_by_one_kind_of_input_is_that_of_float64_differences(name):
-    """The solver has a loop, which has forward mode only, and the renderer a reverse mode of its own."""
+    """Forward, as the solver has a loop. The renderer's reverse mode is tested in render/test_composite.py."""
     function, given, inputs = case(name)
     inputs = tuple(jax.device_get(inputs))
     directions = directions_of(inputs)
-    found = jax.device_get(eqx.filter_jit(slopes(function, name == "render"))(given, inputs, directions))
+    found = jax.device_get(eqx.filter_jit(slopes(function))(given, inputs, directions))
     exact = in_float64(differences(function), given, inputs, directions)
     for one, other in zip(found, exact, strict=True):
         assert np.isfinite(one).all()

@@ -32,7 +32,7 @@ from emgs_jax.slam import as_seen
 CAMERA = cam.Camera([10.0, 11.5], [7.5, 5.25], 16, 12)
 CONFIG = sc.slam_config("slam.submap.map_capacity=48", "slam.submap.submap_capacity=32", "render.tile_capacity=32")
 DENSIFY = densify.DensifyConfig(min_std=0.0, render=CONFIG.refinement.render, points="map")
-ONE, TENTH, FEW = sc.device(1.0), sc.device(0.1), sc.device(0.01)
+ONE = sc.device(1.0)
 ROWS = np.arange(192)
 MOTION = sc.slam_config("slam.motion.num_looks=3").motion
 

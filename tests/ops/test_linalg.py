@@ -33,10 +33,12 @@ def test_whitening_equals_numpy_from_millimetres_to_decametres(stds):
     np.testing.assert_allclose(logdet, np.linalg.slogdet(covs)[1], atol=3 * tolerance)
 
 
-def test_a_matrix_that_is_not_positive_counts_as_the_identity():
-    matrices = np.float32([np.zeros((3, 3)), -np.eye(3), np.diag([1.0, 1.0, -1.0])])
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_a_matrix_that_is_not_positive_counts_as_the_identity(unit):
+    mixed = [np.diag(np.roll([1.0, 1.0, -1.0], i)) for i in range(3)]
+    matrices = np.float32([np.zeros((3, 3)), -np.eye(3), *mixed]) * np.float32(unit)
     triangles, logdets = whitening(matrices)
-    np.testing.assert_array_equal(triangles, np.tile(np.eye(3)[np.tril_indices(3)], (3, 1)))
+    np.testing.assert_array_equal(triangles, np.tile(np.eye(3)[np.tril_indices(3)], (len(matrices), 1)))
     np.testing.assert_array_equal(logdets, 0)
     total = lambda m: jnp.sum(linalg.whitening(m)[0])  # noqa: E731
     assert np.isfinite(on_host(jax.grad(total))(matrices)).all()
@@ -163,6 +165,18 @@ def test_whitening_keeps_all_that_a_flat_covariance_says(ratio):
     white = np.stack(on_host(whiten)(entries(whitening(covs)[0]), entries(across)))
     exact = np.einsum("ni,nij,nj->n", np.float32(across).astype(float), np.linalg.inv(covs.astype(float)), across)
     np.testing.assert_allclose((white.astype(float) ** 2).sum(axis=0), exact, rtol=1e-5)  # a few roundings of offsets
+
+
+def test_a_covariance_of_another_unit_whitens_to_another_unit():
+    """By a power of two, which rounds nothing: flat ones, and ones that rounding has made a little negative."""
+    covs = np.float32(spd(200, 3, (1.0, 0.7, 1e-5)))
+    covs = 0.5 * (covs + covs.mT)
+    covs[:3] = [np.diag(np.roll([1.0, 1.0, -1e-7], i)) for i in range(3)]
+    triangle, logdet = whitening(covs)
+    for power in (-10, 10):
+        other, of_other = whitening(covs * np.float32(4.0**power))
+        np.testing.assert_array_equal(other, triangle / np.float32(2.0**power))
+        np.testing.assert_allclose(of_other - logdet, 6 * power * np.log(2), rtol=1e-6)
 
 
 def test_a_covariance_flatter_than_float32_holds_is_flat_and_not_the_identity():
