@@ -211,11 +211,6 @@ def fuse_clouds(clouds: Iterable[PointCloud], voxel: float) -> PointCloud:
     return spooled(clouds).averaged(voxel).cloud()
 
 
-def voxel_downsample(cloud: PointCloud, voxel: float) -> PointCloud:
-    """Average the points of each voxel [m]; idempotent."""
-    return spooled([cloud], np.float64).averaged(voxel).cloud()
-
-
 def coarse_points(parts: Iterable[np.ndarray], voxel: float) -> np.ndarray:
     """Mean (n, 3) in each voxel of the points (m, 3) of all parts; one part is in memory at a time."""
     tables = [(np.empty(0, np.int64), np.empty((0, 4)))]

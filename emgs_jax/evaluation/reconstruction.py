@@ -20,7 +20,6 @@ from emgs_jax.evaluation.clouds import (
     register,
     spooled,
     transform_cloud,
-    voxel_downsample,
 )
 from emgs_jax.evaluation.trajectory import align_poses
 from emgs_jax.geometry import Sim3
@@ -115,9 +114,9 @@ class Reference:
 
 
 def reference(truth: PointCloud, config: EvaluationConfig) -> Reference:
-    """Prepare a true cloud for comparisons under a protocol, with and without ICP."""
-    cloud, coarse = (voxel_downsample(truth, voxel) for voxel in (config.voxel_m, config.icp_voxel_m))
-    return Reference(cloud, NearestPoints(cloud.points), NearestPoints(coarse.points))
+    """Prepare a true cloud, of one point a voxel, for comparisons under a protocol, with and without ICP."""
+    coarse = coarse_points([truth.points], config.icp_voxel_m)
+    return Reference(truth, NearestPoints(truth.points), NearestPoints(coarse))
 
 
 def compare_clouds(

@@ -13,16 +13,20 @@ from emgs_jax.evaluation.clouds import (
     read_cloud,
     register,
     transform_cloud,
-    voxel_downsample,
 )
+from emgs_jax.evaluation.clouds import spooled as spool
 from emgs_jax.geometry import Sim3
 from emgs_jax.io.ply import save_points_ply, structured, write_ply
+
+
+def averaged(cloud, voxel):
+    return spool([cloud], np.float64).averaged(voxel).cloud()
 
 
 def test_points_of_a_voxel_become_their_means_and_twice_is_once():
     """Its normal is the direction of the mean, and zero where the sides cancel."""
     cloud = random_cloud(np.random.default_rng(7), 5000)
-    small = voxel_downsample(cloud, 0.2)
+    small = averaged(cloud, 0.2)
     cells, inverse = np.unique(np.floor(cloud.points / 0.2), axis=0, return_inverse=True)
     rows = [inverse.ravel() == cell for cell in range(len(cells))]
     points, normals, colors = (
@@ -30,7 +34,7 @@ def test_points_of_a_voxel_become_their_means_and_twice_is_once():
     )
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     assert 0.01 < (length < 0.1).mean() < 0.5, "both kinds of voxels are there"
-    again, expected = voxel_downsample(small, 0.2), np.where(length > 0.1, normals / length, 0.0)
+    again, expected = averaged(small, 0.2), np.where(length > 0.1, normals / length, 0.0)
     for name, values in (("points", points), ("normals", expected), ("colors", colors)):
         np.testing.assert_allclose(getattr(small, name), values, rtol=0, atol=1e-12)
         np.testing.assert_allclose(getattr(again, name), getattr(small, name), atol=1e-12)
@@ -61,7 +65,7 @@ def test_fusing_pieces_is_reducing_the_whole_part_by_part(monkeypatch):
     cloud = random_cloud(np.random.default_rng(4), 900)
     pieces = [PointCloud(cloud.points[i::7], cloud.normals[i::7], cloud.colors[i::7]) for i in range(7)]
     poisoned = PointCloud(np.full((5, 3), np.nan), np.zeros((5, 3)), np.zeros((5, 3)))
-    whole = voxel_downsample(cloud, 0.1)
+    whole = averaged(cloud, 0.1)
     monkeypatch.setattr("emgs_jax.evaluation.clouds.PART_ROWS", 50)
     monkeypatch.setattr("emgs_jax.evaluation.clouds.SOME", 3)
     spooled = SpooledCloud()
