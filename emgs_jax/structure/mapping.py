@@ -65,10 +65,10 @@ def best_start(shots: Shots, config: StructureConfig, folder: Path, evidence: Ev
             break
     if len(shares) == 1 or not best.models:
         return best
+    tried = ", ".join(f"{angle:g}" for angle, _ in STARTS[: len(shares)])
     said = (
-        f"structure: begun {len(shares)} times, with first pairs of {', '.join(f'{STARTS[row][0]:g}' for row in range(len(shares)))} "
-        f"degrees or more; kept is the one of {STARTS[taken][0]:g}, which explains {100 * max(shares):.0f} % of the "
-        f"matches (each: {', '.join(f'{100 * one:.0f}' for one in shares)})"
+        f"structure: begun {len(shares)} times, with first pairs of {tried} degrees or more, which explain "
+        f"{', '.join(f'{100 * one:.0f}' for one in shares)} % of the matches; kept is that of {STARTS[taken][0]:g}"
     )
     return Mapped(best.models, [said, *best.said])
 
@@ -80,6 +80,7 @@ def begin(number: int, shots: Shots, config: StructureConfig, folder: Path, evid
         leave_out(model, evidence)
         turned = turned_right(model, evidence, lambda other: settle(other, shots, config))
         if turned.is_mirrored:
+            triangulate(turned.model, config, folder)
             said.append(
                 f"structure: a model of {model.num_reg_images()} images was inside out: it explains "
                 f"{100 * explained(model, evidence):.0f} % of their matches, its mirror image, which is kept, "
@@ -175,26 +176,44 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path, start: int 
 
 def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) -> None:
     """Register remaining images with fewer inliers."""
-    pycolmap = load()
-    with pycolmap.Database.open(folder / DATABASE) as opened:
-        names = {image.image_id: image.name for image in opened.read_all_images()}
-        cache = pycolmap.DatabaseCache.create(opened, pycolmap.DatabaseCacheOptions(min_num_matches=config.min_inliers))
+    cache, names = _cache(config, folder)
     placed = {image for model in models for image in model.reg_image_ids()}
-    options = pycolmap.IncrementalMapperOptions(
+    options = load().IncrementalMapperOptions(
         abs_pose_min_num_inliers=config.min_inliers,
         abs_pose_refine_focal_length=False,
         abs_pose_refine_extra_params=False,
         random_seed=config.seed,
     )
     for model in models:
-        mapper = pycolmap.IncrementalMapper(cache)
+        mapper = load().IncrementalMapper(cache)
         mapper.begin_reconstruction(model)
         rest = [image for image in sorted(names) if image not in placed and cache.exists_image(image)]
         new = [image for image in rest if mapper.register_next_image(options, image)]
-        for image in new:
-            mapper.triangulate_image(pycolmap.IncrementalTriangulatorOptions(random_seed=config.seed), image)
+        _triangulate(mapper, new, config)
         placed.update(new)
         mapper.end_reconstruction(False)
+
+
+def triangulate(model: Any, config: StructureConfig, folder: Path) -> None:
+    """Find points again that a model lacks."""
+    mapper = load().IncrementalMapper(_cache(config, folder)[0])
+    mapper.begin_reconstruction(model)
+    _triangulate(mapper, sorted(model.reg_image_ids()), config)
+    mapper.end_reconstruction(False)
+
+
+def _triangulate(mapper: Any, images: Sequence[int], config: StructureConfig) -> None:
+    for image in images:
+        mapper.triangulate_image(load().IncrementalTriangulatorOptions(random_seed=config.seed), image)
+
+
+def _cache(config: StructureConfig, folder: Path) -> tuple[Any, dict[int, str]]:
+    """A folder's database in memory, and the names of its images."""
+    pycolmap = load()
+    with pycolmap.Database.open(folder / DATABASE) as opened:
+        names = {image.image_id: image.name for image in opened.read_all_images()}
+        options = pycolmap.DatabaseCacheOptions(min_num_matches=config.min_inliers)
+        return pycolmap.DatabaseCache.create(opened, options), names
 
 
 def adjust(model: Any, shots: Shots, config: StructureConfig) -> None:

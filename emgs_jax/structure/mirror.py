@@ -13,7 +13,7 @@ import numpy as np
 from emgs_jax.structure.evidence import Evidence, explained
 from emgs_jax.structure.library import load
 
-NUM_TRIED = 20  # images with which the mirror image is tried
+NUM_TRIED = 8  # images with which the mirror image is tried
 CLEAR = 0.01  # difference of the explained shares that decides
 
 
@@ -26,7 +26,7 @@ class Turned(NamedTuple):
 
 
 def mirrored(model: Any) -> Any:
-    """A copy with points through the plane at their depth that faces the mean camera, and cameras that turn inversely."""
+    """A copy: points through the plane at their depth that faces the mean camera, cameras that turn inversely."""
     pycolmap, model = load(), copy.deepcopy(model)
     images = [image for image in model.images.values() if image.has_pose]
     poses = [image.cam_from_world().matrix() for image in images]
@@ -71,7 +71,7 @@ def turned_right(model: Any, evidence: Evidence, adjust: Callable[[Any], None]) 
     other = mirrored(part)
     adjust(other)
     gain = explained(other, evidence) - explained(part, evidence)
-    if gain < -CLEAR or (gain < CLEAR and not is_reversed(other, part)):
+    if gain < -CLEAR or not is_reversed(other, part):  # or it turned back
         return Turned(model, False, False)
     whole = mirrored(model) if len(some) < len(images) else other
     if whole is not other:
