@@ -5,8 +5,10 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.ndimage import median_filter
 from tqdm import tqdm
 
+from emgs_jax.data.masks import stem
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.evidence import Evidence, contradicted, explained, joined, read_evidence, share, trust
 from emgs_jax.structure.library import bundle_of, load, options_of
@@ -18,7 +20,9 @@ from emgs_jax.structure.shots import DATABASE, IMAGES, Shots
 STARTS = (16.0, 0.95), (8.0, 0.95), (4.0, 1.0), (2.0, 1.0)
 MAX_FOR_STARTS = 200  # images up to which a weak structure is begun anew
 WEAK = 0.96  # of the matches that pairs alone explain: models that are right explain .97 and more
+REFUSED = 0.7  # of them, below which a model is not believed
 SAME = 0.003  # difference of the share of two starts that agree
+JUMP, JUMP_WINDOW, MIN_FOR_JUMPS = 5.0, 9, 9  # times the usual step; images
 MIN_IMAGES = 3  # of a model, that no larger one holds
 MIN_FOR_CENTER = 30  # images to refine the principal point
 MIN_DEPTH = 0.01  # of a point, in median depths of the image
@@ -45,8 +49,12 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> Mapped:
     check_found(found, shots, config, folder)
     for model in found:
         adjust(model, shots, config)
-    models, more = told_apart(found, evidence)
-    check_found(models, shots, config, folder)
+    models, more = told_apart(found, evidence, shots.names)
+    if not models:
+        raise ValueError(
+            "prior=multiview_stereo finds no structure that the images' matches agree with: what they show may repeat "
+            f"(tiles, doors) or move; take images closer together, or bring predictions (prior=files). {' '.join(more)}"
+        )
     return Mapped(models, said + more)
 
 
@@ -105,8 +113,8 @@ def leave_out(model: Any, evidence: Evidence) -> None:
         observations.deregister_frame(model.images[image].frame_id)
 
 
-def told_apart(found: Sequence[Any], evidence: Evidence) -> Mapped:
-    """Models whose images agreeing matches join, and words on those that are split or doubtful."""
+def told_apart(found: Sequence[Any], evidence: Evidence, names: Sequence[str]) -> Mapped:
+    """Models whose images agreeing matches join, and words on what is split, doubtful or refused."""
     models, said = [], []
     for model in found:
         leave_out(model, evidence)
@@ -116,15 +124,42 @@ def told_apart(found: Sequence[Any], evidence: Evidence) -> Mapped:
                 f"structure: a model of {model.num_reg_images()} images is split into {len(groups)} (of "
                 f"{', '.join(str(len(group)) for group in groups)}): no matches between them agree with it"
             )
-        parts = [model] if len(groups) == 1 == len(joined(model, evidence)) else [only(model, one) for one in groups]
-        for part in parts:
-            if (trusted := trust([part], evidence, within=True)) < WEAK:
-                said.append(
-                    f"structure: doubtful: a model of {part.num_reg_images()} images explains {100 * trusted:.0f} % of "
-                    f"the matches that pairs of its images explain by themselves (usual: 98 or more)"
-                )
-        models += parts
-    return Mapped(sorted(models, key=lambda model: -model.num_reg_images()), said)
+        is_whole = [len(group) for group in groups] == [model.num_reg_images()]
+        models += [model] if is_whole else [only(model, group) for group in groups]
+    believed = []
+    for model in sorted(models, key=lambda model: -model.num_reg_images()):
+        trusted = trust([model], evidence, within=True)
+        about = (
+            f"a model of {model.num_reg_images()} images explains {100 * trusted:.0f} % of the matches that pairs of "
+        )
+        if trusted < REFUSED:
+            said.append(f"structure: {about}by themselves: it is wrong, and left out")
+            continue
+        if trusted < WEAK:
+            said.append(f"structure: doubtful: {about}by themselves (usual: 98 or more)")
+        if where := jumps(model, names):
+            said.append(
+                f"structure: doubtful: the path jumps at {', '.join(where)}: look-alikes may be taken for each other"
+            )
+        believed.append(model)
+    return Mapped(believed, said)
+
+
+def jumps(model: Any, names: Sequence[str]) -> list[str]:
+    """The images to which the camera moves much farther than between the images around them."""
+    row = {name: number for number, name in enumerate(names)}
+    centers = {
+        row[stem(image.name)]: image.projection_center()
+        for image in model.images.values()
+        if image.has_pose and stem(image.name) in row
+    }
+    rows = np.array(sorted(centers))
+    if len(rows) < MIN_FOR_JUMPS:
+        return []
+    steps = np.linalg.norm(np.diff([centers[one] for one in rows], axis=0), axis=1) / np.diff(rows)
+    usual = median_filter(steps, size=JUMP_WINDOW, mode="nearest")
+    is_jump = steps > JUMP * np.maximum(usual, np.median(steps))
+    return [names[one] for one in rows[1:][is_jump]]
 
 
 def refined_lens(shots: Shots, config: StructureConfig) -> tuple[bool, bool]:

@@ -13,6 +13,7 @@ from emgs_jax.structure.mapping import map_database, settle, told_apart
 from emgs_jax.structure.shots import DATABASE
 
 NUM, NOISE = 8, 0.3
+NAMES = [f"{number}" for number in range(NUM)]
 
 
 @pytest.fixture(scope="module")
@@ -71,7 +72,7 @@ def test_images_that_no_agreeing_match_joins_are_models_of_their_own_and_it_is_s
     cut = evidence._replace(
         **{field: [getattr(evidence, field)[row] for row in keep] for field in ("pairs", "matches", "own")}
     )
-    models, said = told_apart([moved], cut)
+    models, said = told_apart([moved], cut, NAMES)
     assert [sorted(one.reg_image_ids()) for one in models] == [images[:4], images[4:]]
     assert len(said) == 1 and "a model of 8 images is split into 2 (of 4, 4)" in said[0]
 
@@ -79,7 +80,7 @@ def test_images_that_no_agreeing_match_joins_are_models_of_their_own_and_it_is_s
 def test_a_model_that_explains_little_is_doubtful(scene):
     model, evidence, _ = scene
     wrong = turn(model, sorted(model.reg_image_ids())[2], 0.4)  # 3.5 pixels
-    _, said = told_apart([wrong], evidence)
+    _, said = told_apart([wrong], evidence, NAMES)
     assert len(said) == 1 and "doubtful: a model of 8 images explains" in said[0]
 
 
@@ -173,3 +174,26 @@ def test_the_map_of_a_database_is_right(scene, tmp_path):
     models, said = map_database(taken, structure_config(), tmp_path)
     assert models[0].num_reg_images() == NUM and said == []
     assert model.num_reg_images() == NUM
+
+
+def walked(distances):
+    """A model of cameras along a line."""
+    model = pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(
+        pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=640, height=480, params=[500.0, 320.0, 240.0, 0.0])
+    )
+    for number, x in enumerate(np.cumsum(distances)):
+        image = pycolmap.Image(name=f"{number}.png", keypoints=np.zeros((1, 2)), camera_id=1, image_id=number + 1)
+        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-x, 0.0, 0.0])))
+    return model
+
+
+def test_a_path_that_jumps_is_told_by_the_images_at_which_it_does():
+    usual = np.random.default_rng(0).uniform(0.5, 1.5, 20)
+    names = [f"{number}" for number in range(20)]
+    assert mapping.jumps(walked(usual), names) == []
+    usual[[7, 8]] = 30.0  # one image far away, and back
+    assert mapping.jumps(walked(usual), names) == ["7", "8"]
+    usual[:10] = 1e-4  # a camera that stands first moves on without a jump
+    assert mapping.jumps(walked(usual), names) == []
+    assert mapping.jumps(walked(usual[:4]), names) == []
