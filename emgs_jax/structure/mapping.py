@@ -1,28 +1,34 @@
 """Map the matches in COLMAP's database: begin as often as it takes, and keep what explains most of them."""
 
+import shutil
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.ndimage import median_filter
 from tqdm import tqdm
 
-from emgs_jax.data.masks import stem
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.evidence import Evidence, contradicted, explained, joined, read_evidence, share, trust
 from emgs_jax.structure.library import bundle_of, load, options_of
 from emgs_jax.structure.mirror import only, turned_right
 from emgs_jax.structure.shots import DATABASE, IMAGES, Shots
 
-# Least angle [deg] between the views of the first pair, and the most that its motion may point ahead, of each start:
-# COLMAP's own first; narrow ones, and motions straight ahead, are for a camera that drives.
-STARTS = (16.0, 0.95), (8.0, 0.95), (4.0, 1.0), (2.0, 1.0)
+
+class Start(NamedTuple):
+    """How the mapper begins."""
+
+    angle: float  # least, between the views of the first pair [deg]
+    ahead: float  # most that its motion may point ahead
+    is_near: bool  # only pairs of images near in time are used, for those far apart may show look-alikes
+
+
+# COLMAP's own first; narrow pairs, and motions straight ahead, are for a camera that drives.
+STARTS = Start(16.0, 0.95, False), Start(8.0, 0.95, True), Start(4.0, 1.0, False), Start(2.0, 1.0, True)
 MAX_FOR_STARTS = 200  # images up to which a weak structure is begun anew
 WEAK = 0.96  # of the matches that pairs alone explain: models that are right explain .97 and more
 REFUSED = 0.7  # of them, below which a model is not believed
-SAME = 0.003  # difference of the share of two starts that agree
-JUMP, JUMP_WINDOW, MIN_FOR_JUMPS = 5.0, 9, 9  # times the usual step; images
+WORSE = 0.03  # of them, by which the start with the most matches explained may be worse than another
 MIN_IMAGES = 3  # of a model, that no larger one holds
 MIN_FOR_CENTER = 30  # images to refine the principal point
 MIN_DEPTH = 0.01  # of a point, in median depths of the image
@@ -44,12 +50,12 @@ def tell(said: Sequence[str]) -> None:
 
 def map_database(shots: Shots, config: StructureConfig, folder: Path) -> Mapped:
     """Map the matches in a folder's database; ValueError, with a reason, if it fails."""
-    evidence = read_evidence(folder / DATABASE, max(1.0, max(shots.size) / config.max_image_size))
+    evidence = read_evidence(folder / DATABASE, shots.names, max(1.0, max(shots.size) / config.max_image_size))
     found, said = best_start(shots, config, folder, evidence)
     check_found(found, shots, config, folder)
     for model in found:
         adjust(model, shots, config)
-    models, more = told_apart(found, evidence, shots.names)
+    models, more = told_apart(found, evidence)
     if not models:
         raise ValueError(
             "prior=multiview_stereo finds no structure that the images' matches agree with: what they show may repeat "
@@ -59,24 +65,27 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> Mapped:
 
 
 def best_start(shots: Shots, config: StructureConfig, folder: Path, evidence: Evidence) -> Mapped:
-    """Begin once where the models explain what their matches allow, else up to all `STARTS`, and keep the best."""
-    shares, best = [], Mapped([], [])
-    for number in range(len(STARTS)):
-        begun = begin(number, shots, config, folder, evidence)
-        score = share(begun.models, evidence)
-        is_same = bool(shares) and bool(begun.models) and abs(score - max(shares)) < SAME
-        if not best.models or score > max(shares):
-            best, taken = begun, number
-        shares.append(score)
-        is_long = len(shots.names) > MAX_FOR_STARTS and bool(best.models)
-        if is_same or is_long or (best.models and trust(best.models, evidence) >= WEAK):
+    """Begin once where the models explain what their matches allow, else up to all `STARTS`, and keep the best.
+
+    The best explains the most matches among those that near pairs bear out.
+    """
+    begun: list[Mapped] = []
+    trusted: list[float] = []
+    while len(begun) < len(STARTS):
+        begun.append(begin(len(begun), shots, config, folder, evidence))
+        trusted.append(trust(begun[-1].models, evidence))
+        if trusted[-1] >= WEAK or (len(shots.names) > MAX_FOR_STARTS and any(one.models for one in begun)):
             break
-    if len(shares) == 1 or not best.models:
+    shares = [share(one.models, evidence) for one in begun]
+    taken = max((row for row, one in enumerate(trusted) if one >= max(trusted) - WORSE), key=lambda row: shares[row])
+    best = begun[taken]
+    if len(begun) == 1 or not best.models:
         return best
-    tried = ", ".join(f"{angle:g}" for angle, _ in STARTS[: len(shares)])
+    tried = ", ".join(f"{start.angle:g}" for start in STARTS[: len(begun)])
     said = (
-        f"structure: begun {len(shares)} times, with first pairs of {tried} degrees or more, which explain "
-        f"{', '.join(f'{100 * one:.0f}' for one in shares)} % of the matches; kept is that of {STARTS[taken][0]:g}"
+        f"structure: begun {len(begun)} times, with first pairs of {tried} degrees or more, which explain "
+        f"{', '.join(f'{100 * one:.0f}' for one in trusted)} % of what images near in time explain by themselves; kept "
+        f"is that of {STARTS[taken].angle:g}{' without pairs far apart in time' * STARTS[taken].is_near}"
     )
     return Mapped(best.models, [said, *best.said])
 
@@ -84,6 +93,7 @@ def best_start(shots: Shots, config: StructureConfig, folder: Path, evidence: Ev
 def begin(number: int, shots: Shots, config: StructureConfig, folder: Path, evidence: Evidence) -> Mapped:
     """Map once, turn models that are inside out, and place images again that their matches contradict."""
     models, said = [], []
+    folder = near_only(folder, evidence) if STARTS[number].is_near else folder
     for model in find_models(shots, config, folder, number):
         leave_out(model, evidence)
         turned = turned_right(model, evidence, lambda other: settle(other, shots, config))
@@ -106,6 +116,18 @@ def begin(number: int, shots: Shots, config: StructureConfig, folder: Path, evid
     return Mapped([model for model in models if model.num_reg_images() >= MIN_IMAGES], said)
 
 
+def near_only(folder: Path, evidence: Evidence) -> Path:
+    """A folder with a copy of the database, in which only images near in time match."""
+    near = folder / "near"
+    near.mkdir(exist_ok=True)
+    shutil.copy(folder / DATABASE, near / DATABASE)
+    with load().Database.open(near / DATABASE) as opened:
+        for pair, is_near in zip(evidence.pairs, evidence.is_near, strict=True):
+            if not is_near:
+                opened.delete_two_view_geometry(*pair)
+    return near
+
+
 def leave_out(model: Any, evidence: Evidence) -> None:
     """Take the images from a model whose matches contradict their poses."""
     observations = load().ObservationManager(model)
@@ -113,7 +135,7 @@ def leave_out(model: Any, evidence: Evidence) -> None:
         observations.deregister_frame(model.images[image].frame_id)
 
 
-def told_apart(found: Sequence[Any], evidence: Evidence, names: Sequence[str]) -> Mapped:
+def told_apart(found: Sequence[Any], evidence: Evidence) -> Mapped:
     """Models whose images agreeing matches join, and words on what is split, doubtful or refused."""
     models, said = [], []
     for model in found:
@@ -137,29 +159,8 @@ def told_apart(found: Sequence[Any], evidence: Evidence, names: Sequence[str]) -
             continue
         if trusted < WEAK:
             said.append(f"structure: doubtful: {about}by themselves (usual: 98 or more)")
-        if where := jumps(model, names):
-            said.append(
-                f"structure: doubtful: the path jumps at {', '.join(where)}: look-alikes may be taken for each other"
-            )
         believed.append(model)
     return Mapped(believed, said)
-
-
-def jumps(model: Any, names: Sequence[str]) -> list[str]:
-    """The images to which the camera moves much farther than between the images around them."""
-    row = {name: number for number, name in enumerate(names)}
-    centers = {
-        row[stem(image.name)]: image.projection_center()
-        for image in model.images.values()
-        if image.has_pose and stem(image.name) in row
-    }
-    rows = np.array(sorted(centers))
-    if len(rows) < MIN_FOR_JUMPS:
-        return []
-    steps = np.linalg.norm(np.diff([centers[one] for one in rows], axis=0), axis=1) / np.diff(rows)
-    usual = median_filter(steps, size=JUMP_WINDOW, mode="nearest")
-    is_jump = steps > JUMP * np.maximum(usual, np.median(steps))
-    return [names[one] for one in rows[1:][is_jump]]
 
 
 def refined_lens(shots: Shots, config: StructureConfig) -> tuple[bool, bool]:
@@ -171,7 +172,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path, start: int 
     """Run the mapper from one of `STARTS`; the largest model first."""
     pycolmap = load()
     is_free, is_bent = refined_lens(shots, config)
-    seed, (angle, forward) = (config.seed + start) % 2**31, STARTS[start]
+    seed, begun = (config.seed + start) % 2**31, STARTS[start]
     common = {"num_threads": config.num_threads, "random_seed": seed}
     given = config.options.get(config.mapper, {})
     output = folder / "models"
@@ -188,8 +189,8 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path, start: int 
             "ba_refine_extra_params": is_bent,
             "mapper": {
                 **common,
-                "init_min_tri_angle": angle,
-                "init_max_forward_motion": forward,
+                "init_min_tri_angle": begun.angle,
+                "init_max_forward_motion": begun.ahead,
                 "abs_pose_refine_focal_length": is_free,
                 "abs_pose_refine_extra_params": is_bent,
             },

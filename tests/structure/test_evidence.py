@@ -7,13 +7,22 @@ import pycolmap
 import pytest
 from stereo_scene import shots, structure_config
 
+from emgs_jax.data.masks import stem
 from emgs_jax.structure import mapping, mirror
-from emgs_jax.structure.evidence import contradicted, count_own, explained, joined, read_evidence, share, trust
+from emgs_jax.structure.evidence import (
+    Evidence,
+    contradicted,
+    count_own,
+    explained,
+    joined,
+    read_evidence,
+    share,
+    trust,
+)
 from emgs_jax.structure.mapping import map_database, settle, told_apart
 from emgs_jax.structure.shots import DATABASE
 
 NUM, NOISE = 8, 0.3
-NAMES = [f"{number}" for number in range(NUM)]
 
 
 @pytest.fixture(scope="module")
@@ -28,7 +37,11 @@ def scene(tmp_path_factory):
         model = pycolmap.synthesize_dataset(options, database)
         noise = pycolmap.SyntheticNoiseOptions(point2D_stddev=NOISE)
         pycolmap.synthesize_noise(noise, model, database)
-    return model, read_evidence(folder / DATABASE, 1.0), folder
+    return model, read_evidence(folder / DATABASE, names_of(model), 1.0), folder
+
+
+def names_of(model):
+    return [stem(model.images[image].name) for image in sorted(model.images)]
 
 
 def turn(model, image, degrees):
@@ -70,9 +83,12 @@ def test_images_that_no_agreeing_match_joins_are_models_of_their_own_and_it_is_s
     half = {*images[:4]}
     keep = [row for row, (a, b) in enumerate(evidence.pairs) if (a in half) == (b in half)]
     cut = evidence._replace(
-        **{field: [getattr(evidence, field)[row] for row in keep] for field in ("pairs", "matches", "own")}
+        pairs=[evidence.pairs[row] for row in keep],
+        matches=[evidence.matches[row] for row in keep],
+        own=evidence.own[keep],
+        is_near=evidence.is_near[keep],
     )
-    models, said = told_apart([moved], cut, NAMES)
+    models, said = told_apart([moved], cut)
     assert [sorted(one.reg_image_ids()) for one in models] == [images[:4], images[4:]]
     assert len(said) == 1 and "a model of 8 images is split into 2 (of 4, 4)" in said[0]
 
@@ -80,7 +96,7 @@ def test_images_that_no_agreeing_match_joins_are_models_of_their_own_and_it_is_s
 def test_a_model_that_explains_little_is_doubtful(scene):
     model, evidence, _ = scene
     wrong = turn(model, sorted(model.reg_image_ids())[2], 0.4)  # 3.5 pixels
-    _, said = told_apart([wrong], evidence, NAMES)
+    _, said = told_apart([wrong], evidence)
     assert len(said) == 1 and "doubtful: a model of 8 images explains" in said[0]
 
 
@@ -108,14 +124,12 @@ def far(count=6, distance=8.0):
 
 def evidence_of(model):
     """All matches of a model's points."""
-    from emgs_jax.structure.evidence import Evidence
-
     images = sorted(model.reg_image_ids())
     keypoints = {image: np.array([point.xy for point in model.images[image].points2D]) for image in images}
     pairs = [(a, b) for a in images for b in images if a < b]
     matches = [np.repeat(np.arange(len(keypoints[images[0]]))[:, None], 2, axis=1)] * len(pairs)
-    own = [count_own(None, keypoints[a], keypoints[b], 1.0) for a, b in pairs]
-    return Evidence(pairs, matches, own, keypoints, 1.0)
+    own = np.array([count_own(None, keypoints[a], keypoints[b], 1.0) for a, b in pairs])
+    return Evidence(pairs, matches, own, np.ones(len(pairs), bool), keypoints, 1.0)
 
 
 def test_a_structure_that_is_inside_out_is_turned_and_one_that_is_right_stays():
@@ -174,26 +188,3 @@ def test_the_map_of_a_database_is_right(scene, tmp_path):
     models, said = map_database(taken, structure_config(), tmp_path)
     assert models[0].num_reg_images() == NUM and said == []
     assert model.num_reg_images() == NUM
-
-
-def walked(distances):
-    """A model of cameras along a line."""
-    model = pycolmap.Reconstruction()
-    model.add_camera_with_trivial_rig(
-        pycolmap.Camera(camera_id=1, model="SIMPLE_RADIAL", width=640, height=480, params=[500.0, 320.0, 240.0, 0.0])
-    )
-    for number, x in enumerate(np.cumsum(distances)):
-        image = pycolmap.Image(name=f"{number}.png", keypoints=np.zeros((1, 2)), camera_id=1, image_id=number + 1)
-        model.add_image_with_trivial_frame(image, pycolmap.Rigid3d(pycolmap.Rotation3d(), np.array([-x, 0.0, 0.0])))
-    return model
-
-
-def test_a_path_that_jumps_is_told_by_the_images_at_which_it_does():
-    usual = np.random.default_rng(0).uniform(0.5, 1.5, 20)
-    names = [f"{number}" for number in range(20)]
-    assert mapping.jumps(walked(usual), names) == []
-    usual[[7, 8]] = 30.0  # one image far away, and back
-    assert mapping.jumps(walked(usual), names) == ["7", "8"]
-    usual[:10] = 1e-4  # a camera that stands first moves on without a jump
-    assert mapping.jumps(walked(usual), names) == []
-    assert mapping.jumps(walked(usual[:4]), names) == []
