@@ -16,7 +16,7 @@ from emgs_jax.prior.multiview.depth import DepthConfig
 from emgs_jax.prior.multiview.planar import PlanarConfig
 from emgs_jax.prior.sources import Sources
 from emgs_jax.structure.config import StructureConfig
-from emgs_jax.structure.reconstruct import Shots
+from emgs_jax.structure.shots import Shots
 
 FOCAL, CENTER, SIZE = (55.0, 53.0), (30.5, 24.25), (64, 48)
 SMALL = ("prior.dense.depth.sweep.num_planes=24",)

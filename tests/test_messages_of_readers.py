@@ -38,7 +38,8 @@ from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.structure.given import given_models
 from emgs_jax.structure.library import member, options_of
-from emgs_jax.structure.reconstruct import Shots, matcher_of
+from emgs_jax.structure.reconstruct import matcher_of
+from emgs_jax.structure.shots import Shots
 from tests.data.test_calibration_files import CORNER, KALIBR, MAST3R, ORB, ROS, TRANSFORMS
 from tests.data.test_calibration_files import PLAIN as OF_VIPE
 from tests.data.written_benchmarks import CAMERAS, EUROC_SIZE, write_colmap, write_euroc, write_kitti, write_nerfstudio

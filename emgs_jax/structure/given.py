@@ -16,7 +16,8 @@ from emgs_jax.data.masks import stem
 from emgs_jax.data.reading import stretch
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.library import load
-from emgs_jax.structure.reconstruct import DATABASE, Shots, map_database
+from emgs_jax.structure.mapping import map_database, tell
+from emgs_jax.structure.shots import DATABASE, Shots
 
 PARTS = ("cameras", "images")
 SAME_FOCAL = 0.01  # relative difference up to which cameras are one: less than what it costs to map as another
@@ -72,7 +73,8 @@ def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any
             shutil.copy(database, Path(work) / DATABASE)
             try:
                 take_camera(Path(work) / DATABASE, shots, key)
-                models = map_database(shots, config, Path(work))
+                models, said = map_database(shots, config, Path(work))
+                tell(said)
             except RuntimeError as error:
                 raise ValueError(f"{key} is no database of COLMAP, or a damaged one ({error})") from error
     for model in models:

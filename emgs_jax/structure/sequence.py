@@ -14,7 +14,7 @@ from emgs_jax.data.masks import image_names, names_of
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import in_use
 from emgs_jax.structure.model import Structure, to_structure
-from emgs_jax.structure.reconstruct import Shots
+from emgs_jax.structure.shots import Shots
 from emgs_jax.structure.store import make_models, models_of
 
 ESTIMATED = "structure"  # in a data set's calibration: key of the structure that its camera is from

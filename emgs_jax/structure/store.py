@@ -16,14 +16,16 @@ from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.io.files import write_file
-from emgs_jax.structure import reconstruct
+from emgs_jax.structure import evidence, mapping, mirror, reconstruct
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import given_models, read_models, stems_of
 from emgs_jax.structure.library import load
-from emgs_jax.structure.reconstruct import Shots, map_images
+from emgs_jax.structure.mapping import tell
+from emgs_jax.structure.reconstruct import map_images
+from emgs_jax.structure.shots import Shots
 
 ABOUT = "structure.json"
-VERSION = 1  # changes with the code of `structure/`, if that makes other models of the same images
+VERSION = 2  # changes with the code of `structure/`, if that makes other models of the same images
 NOT_OF_MODELS = ("model", "median_depth", "pixel_std")  # settings that do not change the models
 CACHE = Path("~/.cache/emgs_jax/structure")
 
@@ -46,7 +48,8 @@ def key_of(shots: Shots, config: StructureConfig) -> str:
 
 def _constants() -> dict[str, Any]:
     """The numbers that models are made with, and nobody sets."""
-    return {name: value for name, value in vars(reconstruct).items() if name.isupper()}
+    modules = evidence, mapping, mirror, reconstruct
+    return {name: value for module in modules for name, value in vars(module).items() if name.isupper()}
 
 
 def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> tuple[str, list[Any]]:
@@ -72,6 +75,7 @@ def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> t
         if there is None:
             there = _made(shots, config, key, places)
         models = read_models(there)
+        tell(json.loads((there / ABOUT).read_text(encoding="utf-8")).get("said", ()))
         for place in places:
             if not is_of(place, key):
                 try:
@@ -106,7 +110,8 @@ def _made(shots: Shots, config: StructureConfig, key: str, places: Sequence[Path
             (work / "is_writable").touch()
         except OSError:
             continue
-        write_models(map_images(shots, config, work), key, place)
+        models, said = map_images(shots, config, work)
+        write_models(models, key, place, said)
         shutil.rmtree(work, ignore_errors=True)
         return place
     raise ValueError(f"no folder can be written: {', '.join(map(str, places))}; give hydra.run.dir=DIR")
@@ -120,14 +125,15 @@ def is_of(place: Path, key: str) -> bool:
         return False
 
 
-def write_models(models: Sequence[Any], key: str, place: Path) -> None:
-    """Write models for COLMAP, a folder each, and last their key."""
+def write_models(models: Sequence[Any], key: str, place: Path, said: Sequence[str] = ()) -> None:
+    """Write models for COLMAP, a folder each, and last their key and what is to be said of them."""
     _clear(place)
     for number, model in enumerate(models):
         folder = place / str(number)
         folder.mkdir(exist_ok=True)
         model.write_binary(folder)
-    about = {"key": key, "pycolmap": load().__version__, "images": [model.num_reg_images() for model in models]}
+    images = [model.num_reg_images() for model in models]
+    about = {"key": key, "pycolmap": load().__version__, "images": images, "said": [*said]}
     write_file(place / ABOUT, json.dumps(about, indent=1).encode())
 
 

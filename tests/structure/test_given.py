@@ -11,7 +11,7 @@ from emgs_jax.data.intrinsics import Pictures
 from emgs_jax.structure import sequence
 from emgs_jax.structure.given import given_models
 from emgs_jax.structure.model import stem, to_structure
-from emgs_jax.structure.reconstruct import Shots
+from emgs_jax.structure.shots import Shots
 from emgs_jax.structure.uncertainty import camera_in_world
 
 NUM, SIZE, FOCAL = 8, (640, 480), 500.0

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from stereo_scene import shots, structure_config
 
 from emgs_jax.structure.given import given_models, read_models
+from emgs_jax.structure.mapping import drop_points_at_cameras
 from emgs_jax.structure.model import NONE, stem, to_structure
-from emgs_jax.structure.reconstruct import DATABASE, drop_points_at_cameras
+from emgs_jax.structure.shots import DATABASE
 from emgs_jax.structure.store import make_models, write_models
 from emgs_jax.structure.uncertainty import camera_in_world
 
