@@ -106,7 +106,7 @@ def cameras_first(end_all: Callable[[], bool]) -> Iterator[None]:
         if not end_all():
             before(number, frame)
             return
-        os.write(2, b"\nno more images are taken: the map is finished and written (Ctrl-C again stops at once)\n")
+        os.write(2, b"\nno more images are taken; the map is finished and written (Ctrl-C again stops at once)\n")
 
     before = signal.signal(signal.SIGINT, first)
     try:

@@ -91,7 +91,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             if fitting is not None:
                 extra(*OPTAX)
             if isinstance(watched, RosConfig):
-                live = stack.enter_context(ros_view(watched, folder))
+                words = str(config.dataset.get("source", "")).split()[1:]
+                live = stack.enter_context(ros_view(watched, folder, words, has_saved_map=saved is not None))
             else:
                 live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
             baselines = Baselines(fused, slam.observation, dataset)
@@ -99,7 +100,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             origin = provenance(settings, dataset, prior.provenance)
             if saved is not None:
                 origin["map"] = saved.checksum
-            checkpoint = None if is_live else build(config, "checkpoint")  # frames that have passed do not come again
+            # Frames of a camera do not come again.
+            checkpoint = None if "record" in config.dataset else build(config, "checkpoint")
             keeper = Keeper(folder / CHECKPOINT_FILE, checkpoint, signature(origin))
         for note in [*filter(None, [keeper.note]), *claim_folder(folder, keeper.found is not None)]:
             tqdm.write(note)
@@ -107,7 +109,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         dataset.begin()
         session, raw = _map(session, dataset, prior, (baselines, evaluation, keeps_points), folder, keeper, live)
         if is_live:  # all its frames are known now
-            origin = provenance(settings, dataset, prior.provenance)
+            origin = origin | {"data": provenance(settings, dataset, prior.provenance)["data"]}
         origin["config"] |= {"dataset": dataset.recording() or settings["dataset"]}
         # The raw prior is scored while the map is drawn and written.
         with ThreadPoolExecutor(2, "raw prior") as threads:

@@ -18,7 +18,7 @@ SECONDS = 5.0  # for an image, from COLMAP to the report, on one core
 
 def with_source(arguments: list[str]) -> list[str]:
     """Replace the path among the arguments of `emgs run`, if any, by the keys that it implies, and print them."""
-    words = [word for word in words_of(arguments).overrides if "=" not in word]
+    words = [word for word in words_of(arguments).overrides if "=" not in word or CAMERA.match(word)]
     paths = [word for word in words if word[0] != "~" or word.startswith("~/")]  # ~KEY removes a key
     if not paths:
         return arguments
@@ -43,7 +43,8 @@ def of_camera(word: str, given: list[str]) -> list[str]:
     source = word.removeprefix("camera").removeprefix(":") or "0"
     found = {"dataset": "camera", "dataset.source": written(source)}
     if keys.get("prior", "multiview_stereo") == "multiview_stereo":  # it needs all images before it begins
-        found |= {"prior": "multiview_stereo", "graph": "up_to_scale", "dataset.intrinsics": "estimate"}
+        found |= {"prior": "multiview_stereo", "dataset.intrinsics": "estimate"}
+        found |= {} if "baseline" in keys else {"graph": "up_to_scale"}
         found |= {"dataset.fps": str(FPS), "dataset.record": "true"}
     words = [f"{key}={value}" for key, value in found.items() if key not in keys]
     print(f"settings for camera {source}: {' '.join(words)} (your own win)")

@@ -415,7 +415,7 @@ OF_PREDICTIONS = [
     ({"names": ["a", "b", "c"]}, "or choose the frames that were predicted"),
     (put("own/IMG_9.npz", b"PK"), "IMG_9.npz: .*; it has nothing"),
     ((own(".npy"), listed_poses(), put("own/IMG_9.npy", b"x")), "no .npy that can be read .*: write it again"),
-    (own(".npy"), "of poses.txt, poses.json: prior=files needs poses beside depths"),
+    (own(".npy"), "of poses.txt, poses.json: poses are needed beside depths"),
     ((own(".npy"), listed_poses(5)), "must have one for each"),
     (
         (own(".npy"), listed_poses(), lines("own/poses.txt", lambda words: [f"{9 - float(words[0])}", *words[1:]])),

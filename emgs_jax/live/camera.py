@@ -7,7 +7,7 @@ memory is bounded, and the same command on the folder maps the same frames again
 import tempfile
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,13 +16,12 @@ import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.data.base import wait_for_all
-from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.images import Images
-from emgs_jax.data.intrinsics import Given, Pictures, find_lens
+from emgs_jax.data.intrinsics import Given, Pictures, find_lens, to_lens
 from emgs_jax.data.reading import Size, about_pixels
 from emgs_jax.data.straightened import Straightened
 from emgs_jax.io.files import atomic_write
-from emgs_jax.live.capture import start
+from emgs_jax.live.capture import is_ros, start
 from emgs_jax.live.newest import Newest, Shot
 
 RECORDED = "recorded"  # folder of a run
@@ -58,25 +57,30 @@ class Camera(Straightened):
         self._newest, self._is_over = Newest(), False
         self._images, self._times, self._arrived, self._mapped = [], [], [], []
         self.sequence, self._given = str(self.source), self.intrinsics  # `_use` replaces the latter
-        if self._given in (None, "exif") and not self.sequence.startswith("ros"):
+        if self._given == "exif" or (self._given is None and not is_ros(self.sequence)):
             raise ValueError(NO_INTRINSICS)
         self._folder = self._new_folder()
-        told = start(self.sequence, self._newest)
-        self._given = numbers_of(told) if self._given is None and told is not None else self._given
-        if self._given is None:
-            raise ValueError(NO_INTRINSICS)
+        told = start(self.sequence, self._newest, needs_camera=self._given is None)
         shot = self._newest.take(FIRST_S)
         if shot is None:
             raise ValueError(self._newest.reason or self._said(f"gives no image in {FIRST_S:g} s"))
         self._begin, self._raw_size = shot.arrived, shot.image.shape[1::-1]
         self.size = about_pixels(*self._raw_size) if self.size is None else self.size
-        self._lens = None
+        name, self._bent = f"images of camera {self.source}", None
         if callable(self._given):
             self._add(shot)
             wait_for_all(self)
-        name = f"images of camera {self.source}"
-        pictures = Pictures(self._raw_size, max(len(self), 1), self._read, [*self._images], name)
-        self._use(find_lens(self._given, pictures), self._raw_size, f"{as_words(self._raw_size)}, {name}")
+            lens = find_lens(self._given, Pictures(self._raw_size, len(self), self._read, [*self._images], name))
+        else:  # what is written has no distortion
+            pictures = Pictures(self._raw_size, 1, lambda _: shot.image, name=name)
+            lens = self._bent = (
+                find_lens(self._given, pictures)
+                if told is None
+                else to_lens(told, self._raw_size, "CameraInfo", {"source": "CameraInfo"}, name)
+            )
+            self._given = [*lens.intrinsics] if lens.maps is not None or told is not None else self._given
+            lens = replace(lens, maps=None)
+        self._use(lens, self._raw_size, f"{as_words(self._raw_size)}, {name}")
         if not self._images:
             self._add(shot)
 
@@ -86,44 +90,61 @@ class Camera(Straightened):
         return f"camera {self.source} {words}" + (f": {problem}" if problem else "")
 
     def _new_folder(self) -> Path:
-        if not self.record:
-            self._temporary = tempfile.TemporaryDirectory(prefix="emgs_camera_")  # deleted with this object
+        if not self.record:  # deleted with this object
+            self._temporary = tempfile.TemporaryDirectory(prefix=".camera_", dir=self.folder)
             return Path(self._temporary.name)
         if self.folder is None:
             raise ValueError("dataset.record=true needs the folder of a run: give Camera its folder")
         folder = self.folder / RECORDED
         if folder.exists():
-            raise ValueError(f"{folder} holds an earlier recording: give hydra.run.dir=ANOTHER, or move it away")
+            raise ValueError(
+                f"{folder} holds an earlier recording: map it (emgs run {folder}), or give hydra.run.dir=ANOTHER"
+            )
         folder.mkdir(parents=True)
         return folder
 
     def _add(self, shot: Shot) -> None:
-        """Write an image, and what came with it, under its time."""
-        time_s = shot.time
+        """Write an image, and what came with it, under its time, without distortion."""
+        time_s = round(shot.time, 6)
+        if time_s < 0:
+            raise ValueError(f"camera {self.source} has a time below 0 ({time_s:g} s): set its clock")
         if self._times and time_s <= self._times[-1]:  # a clock that was set back, or is coarse
-            time_s = self._times[-1] + 1e-6
-        path = self._folder / f"{time_s:.6f}.png"
-        if shot.given:
-            given = dict(shot.given)
-            if self._lens is not None and given.get("depth", np.zeros(0)).shape == shot.image.shape[:2]:
-                given["depth"] = self._lens.straighten_depth(given["depth"])  # it is registered to the image
+            time_s = round(self._times[-1] + 1e-6, 6)
+        path, image, given = self._folder / f"{time_s:.6f}.png", shot.image, dict(shot.given or {})
+        if self._bent is not None and self._bent.maps is not None:
+            image = self._bent.straighten(image)
+            for name in {"depth", "confidence"} & given.keys():
+                if given[name].shape != image.shape[:2]:
+                    raise ValueError(
+                        f"the {name} of camera {self.source} has not the size of its images, whose lens has "
+                        "distortion: take rectified images"
+                    )
+                given[name] = self._bent.straighten_depth(given[name])  # registered to the image
+        elif self._bent is None and "depth" in given:
+            raise ValueError("with a depth for each image dataset.intrinsics=[fx,fy,cx,cy] are needed, not estimate")
+        if given:
             with atomic_write(path.with_suffix(".npz")) as handle:
                 np.savez(handle, **given)
         with atomic_write(path) as handle:
-            handle.write(cv2.imencode(".png", cv2.cvtColor(shot.image, cv2.COLOR_RGB2BGR), FAST)[1])
+            handle.write(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), FAST)[1])
         self._images.append(path)
         self._times.append(float(path.stem))
         self._arrived.append(shot.arrived)
 
     def has(self, index: int) -> bool:
+        self._newest.begun.set()
         while len(self) <= index:
             shot = self._next()
-            if shot is None:
-                if not self._is_over:
-                    tqdm.write(f"no more images: {self._newest.reason}")
-                self._is_over = True
-                return False
-            self._add(shot)
+            if shot is not None:
+                try:
+                    self._add(shot)
+                    continue
+                except (OSError, ValueError) as error:  # such as a full disk
+                    self._newest.end(str(error))
+            if not self._is_over:
+                tqdm.write(f"no more images: {self._newest.reason}")
+            self._is_over = True
+            return False
         return True
 
     def _next(self) -> Shot | None:
@@ -135,7 +156,7 @@ class Camera(Straightened):
             if self.max_seconds is not None and time.monotonic() - self._begin > self.max_seconds:
                 self._newest.end(f"dataset.max_seconds={self.max_seconds:g} have passed")
                 return None
-            shot = self._newest.take(NEXT_S)
+            shot = self._newest.take(None if self._newest.can_wait else NEXT_S)
             if shot is None:
                 self._newest.end(self._said(f"has given none for {NEXT_S:g} s"))
                 return None
@@ -148,7 +169,9 @@ class Camera(Straightened):
 
     def begin(self) -> None:
         """Begin with the newest image: the first one came before the programs were compiled."""
-        shot = self._newest.take(NEXT_S) if len(self) == 1 and self.total is None else None
+        is_late = len(self) == 1 and self.total is None and not self._newest.can_wait
+        self._newest.begun.set()
+        shot = self._newest.take(NEXT_S) if is_late else None
         if shot is None or shot.image.shape[1::-1] != self._raw_size:
             return
         for path in (self._images[0], self._images[0].with_suffix(".npz")):
@@ -159,7 +182,7 @@ class Camera(Straightened):
 
     @property
     def total(self) -> int | None:
-        return None if self._newest.reason is None else len(self)
+        return len(self) if self._newest.is_over else None
 
     def number(self, index: int) -> int:
         return index
@@ -199,10 +222,3 @@ class Camera(Straightened):
 def as_words(size: Size) -> str:
     """Name images by their (width, height)."""
     return f"images of {size[0]}x{size[1]}"
-
-
-def numbers_of(camera: Calibration) -> list[float]:
-    """Write a camera as `dataset.intrinsics`; ValueError for a lens that needs a calibration file."""
-    if camera.model != "OPENCV":
-        raise ValueError(f"the lens is {camera.model}: take the rectified topic, or give dataset.intrinsics")
-    return [*camera.intrinsics, *camera.distortion]

@@ -23,18 +23,23 @@ RTSP_OPTIONS = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
 GIVEN = ("depth", "T_world_camera", "intrinsics", "confidence")  # arrays beside an image, as in files of prior=files
 
 
-def start(source: str, into: Newest) -> Calibration | None:
+def start(source: str, into: Newest, needs_camera: bool = False) -> Calibration | None:
     """Open a source and offer its images to `into`, from a thread; ValueError if it cannot be opened.
 
-    Returns the camera if the source tells it.
+    Returns the camera if that is needed and the source tells it.
     """
-    if source.split()[0] == "ros":
+    if is_ros(source):
         from emgs_jax.live.ros import subscribe  # an extra
 
-        return subscribe(source.split()[1:], into)
-    shots = open_source(source)
+        return subscribe(source.split()[1:], into, needs_camera)
+    shots = open_source(source, into)
     threading.Thread(target=_offer, args=(shots, source, into), name=f"camera {source}", daemon=True).start()
     return None
+
+
+def is_ros(source: str) -> bool:
+    """Test whether a source is the word "ros" and remappings of topics."""
+    return source.split()[:1] == ["ros"]
 
 
 def _offer(shots: Iterator[Shot], source: str, into: Newest) -> None:
@@ -49,13 +54,13 @@ def _offer(shots: Iterator[Shot], source: str, into: Newest) -> None:
         shots.close()
 
 
-def open_source(source: str) -> Iterator[Shot]:
+def open_source(source: str, into: Newest) -> Iterator[Shot]:
     """Open a camera by its number or device, the address of a stream, a video or a recorded folder."""
     path = Path(source).expanduser()
-    if path.is_dir():
-        return _paced(_recorded(path))
-    if path.suffix.lower() in VIDEO_SUFFIXES and path.is_file():
-        return _paced(_of_video(Video(path)))
+    is_video = path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
+    if path.is_dir() or is_video:
+        into.can_wait = True
+        return _paced(_of_video(Video(path)) if is_video else _recorded(path), into.begun)
     if "://" in source:
         os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", RTSP_OPTIONS)
     capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
@@ -100,11 +105,15 @@ def _recorded(folder: Path) -> Iterator[tuple[float, Callable[[], Shot]]]:
         yield seconds, read
 
 
-def _paced(shots: Iterator[tuple[float, Callable[[], Shot]]]) -> Iterator[Shot]:
-    """Yield images at the pace of their times."""
-    first, begin = None, time.monotonic()
-    for seconds, read in shots:
+def _paced(shots: Iterator[tuple[float, Callable[[], Shot]]], begun: threading.Event) -> Iterator[Shot]:
+    """Yield the first image, and the others at the pace of their times once images are wanted."""
+    for number, (seconds, read) in enumerate(shots):
         shot = read()
-        first = seconds if first is None else first
-        time.sleep(max(begin + seconds - first - time.monotonic(), 0.0))
+        if number == 0:
+            first = seconds
+        elif number == 1:
+            begun.wait()
+            begin = time.monotonic()
+        if number:
+            time.sleep(max(begin + seconds - first - time.monotonic(), 0.0))
         yield shot

@@ -9,7 +9,8 @@ from scipy.spatial.transform import Rotation, Slerp
 
 MAX_APART_S = 0.02  # from an image to its depth
 MAX_GAP_S = 0.5  # between two poses between which one is interpolated
-MAX_WAITING = 60  # messages of each kind; an image that nothing fits is left out by then
+KEPT_S = 3.0  # messages of each kind; an image that nothing fits is left out by then
+BACK_S = 1.0  # a stamp so far before the newest of its kind begins anew: a bag that is played again
 
 
 class Joined:
@@ -28,42 +29,42 @@ class Joined:
 
     def add(self, kind: str, time_s: float, value: Any) -> Iterator[tuple[float, dict[str, Any]]]:
         """Add a message of an "image", a "depth" or a "pose" (4, 4); yield what is whole, in order of time."""
-        kept = self._waiting[kind]
+        kept, images = self._waiting[kind], self._waiting["image"]
+        if kept and time_s < kept[-1][0] - BACK_S:
+            for messages in self._waiting.values():
+                messages.clear()
         kept.insert(bisect_left(kept, time_s, key=lambda item: item[0]), (time_s, value))
-        images = self._waiting["image"]
-        if kind != "image" and len(kept) > MAX_WAITING:
+        while kept[-1][0] - kept[0][0] > KEPT_S:
+            self.num_alone += kind == "image"
             del kept[0]
         for place, (image_time, image) in enumerate(images):
-            found = {kind: self._at(kind, image_time) for kind in self._kinds}
-            if all(value is not None for value in found.values()):
+            found = self._found(image_time)
+            if found is not None:
                 self.num_alone += place  # later ones are whole, so these will not be
                 del images[: place + 1]
                 yield image_time, {"image": image, **found}
                 yield from self._rest()
                 return
-        if len(images) > MAX_WAITING:
-            self.num_alone += 1
-            del images[0]
 
     def _rest(self) -> Iterator[tuple[float, dict[str, Any]]]:
         """Yield later images that are whole, too."""
         images = self._waiting["image"]
-        while images:
-            found = {kind: self._at(kind, images[0][0]) for kind in self._kinds}
-            if any(value is None for value in found.values()):
-                return
+        while images and (found := self._found(images[0][0])) is not None:
             time_s, image = images.pop(0)
             yield time_s, {"image": image, **found}
 
-    def _at(self, kind: str, time_s: float) -> Any | None:
-        kept = self._waiting[kind]
-        times = [time for time, _ in kept]
-        if kind == "pose":
-            return pose_at(kept, time_s)
-        if not times:
-            return None
-        nearest = min(range(len(times)), key=lambda row: abs(times[row] - time_s))
-        return kept[nearest][1] if abs(times[nearest] - time_s) <= MAX_APART_S else None
+    def _found(self, time_s: float) -> dict[str, Any] | None:
+        """What belongs to an image of this time; None if something has not come yet."""
+        found = {kind: FIND[kind](self._waiting[kind], time_s) for kind in self._kinds}
+        return None if any(value is None for value in found.values()) else found
+
+
+def nearest(kept: list[tuple[float, Any]], time_s: float) -> Any | None:
+    """Return the message nearest in time, once one is there that is not earlier; None if it is too far away."""
+    if not kept or kept[-1][0] < time_s:
+        return None
+    at, value = min(kept, key=lambda item: abs(item[0] - time_s))
+    return value if abs(at - time_s) <= MAX_APART_S else None
 
 
 def pose_at(poses: list[tuple[float, np.ndarray]], time_s: float) -> np.ndarray | None:
@@ -80,3 +81,6 @@ def pose_at(poses: list[tuple[float, np.ndarray]], time_s: float) -> np.ndarray 
     pose[:3, :3] = Slerp((0, 1), Rotation.from_matrix([a[:3, :3], b[:3, :3]]))(share).as_matrix()
     pose[:3, 3] = (1 - share) * a[:3, 3] + share * b[:3, 3]
     return pose
+
+
+FIND = {"depth": nearest, "pose": pose_at}

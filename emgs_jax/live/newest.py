@@ -32,12 +32,15 @@ class Newest:
     Attributes:
         num_dropped: images that came and were not taken.
         reason: why no more will come; None while they may.
-        problem: why the last one that could not be read could not; None if there was none.
+        problem: why images that came could not be used; None if there was nothing.
+        begun: set once images are wanted; a source that can wait, such as a recording, begins then.
+        can_wait: the source does so, and its images are all wanted.
     """
 
     def __init__(self) -> None:
         self._changed, self._shot = threading.Condition(), None
         self.num_dropped, self.reason, self.problem = 0, None, None
+        self.begun, self.can_wait = threading.Event(), False
         _running.add(self)
 
     def put(self, shot: Shot) -> bool:
@@ -50,8 +53,14 @@ class Newest:
             self._changed.notify_all()
             return True
 
-    def take(self, timeout_s: float) -> Shot | None:
-        """Wait for an image and take it; None after the last one, or if none comes in time."""
+    @property
+    def is_over(self) -> bool:
+        """Whether the last image has been taken."""
+        with self._changed:
+            return self.reason is not None and self._shot is None
+
+    def take(self, timeout_s: float | None) -> Shot | None:
+        """Wait for an image and take it; None after the last one, or if none comes in time (None: for ever)."""
         with self._changed:
             self._changed.wait_for(lambda: self._shot is not None or self.reason is not None, timeout_s)
             shot, self._shot = self._shot, None

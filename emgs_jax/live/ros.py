@@ -6,8 +6,10 @@
 
 import contextlib
 import threading
+import time
 from collections.abc import Sequence
 from functools import partial
+from queue import Queue
 from types import ModuleType
 from typing import Any
 
@@ -31,42 +33,40 @@ BAYER |= {"bayer_gbrg8": cv2.COLOR_BayerGR2RGB, "bayer_grbg8": cv2.COLOR_BayerGB
 MILLIMETRE = 1e-3
 
 
-def started(words: Sequence[str]) -> ModuleType:
-    """Return rclpy, initialised once in this process with `words` like `image:=/camera/image_raw`.
+def new_node(name: str, words: Sequence[str]) -> tuple[ModuleType, Any]:
+    """Return rclpy and a node of it with remappings like `image:=/camera/image_raw` or `__ns:=/robot`.
 
     Raises:
-        ValueError: it is not installed, or a word is no remapping.
+        ValueError: rclpy is not installed, or a word is no remapping.
     """
     rclpy = extra("rclpy", "ROS 2 needs rclpy, the robot's own (source its setup.bash) or", "ros")
     for word in words:
-        name, is_remapping, topic = word.partition(":=")
-        if not is_remapping or name not in (*TOPICS, *PUBLISHED) or not topic:
-            known = ", ".join((*TOPICS, *PUBLISHED))
+        what, is_remapping, topic = word.partition(":=")
+        if not is_remapping or what not in (*TOPICS, *PUBLISHED, "__ns") or not topic:
+            known = ", ".join((*TOPICS, *PUBLISHED, "__ns"))
             raise ValueError(f"{word} is no remapping NAME:=TOPIC of one of {known}")
     if not rclpy.ok():
         from rclpy.signals import SignalHandlerOptions
 
-        remapped = [part for word in words for part in ("-r", word)]
-        arguments = ["emgs", "--ros-args", *remapped] if remapped else ["emgs"]
-        rclpy.init(args=arguments, signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C is the command's
-    return rclpy
+        rclpy.init(args=["emgs"], signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C is the command's
+    remapped = [part for word in words for part in ("-r", word)]
+    return rclpy, rclpy.create_node(name, cli_args=["--ros-args", *remapped] if remapped else [])
 
 
-def subscribe(words: Sequence[str], into: Newest) -> Calibration | None:
-    """Offer the images of the topics to `into`, from a thread; return their camera.
+def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibration | None:
+    """Offer the images of the topics to `into`, from a thread; return their camera if it is needed.
 
     Raises:
-        ValueError: no CameraInfo comes.
+        ValueError: it is needed, and no CameraInfo comes.
     """
-    rclpy = started(words)
+    _, node = new_node("emgs", words)
     from rclpy.executors import SingleThreadedExecutor
     from rclpy.qos import DurabilityPolicy, QoSProfile, qos_profile_sensor_data
     from sensor_msgs.msg import CameraInfo, CompressedImage, Image
 
     topics = dict(word.split(":=") for word in words)
-    node, told = rclpy.create_node("emgs"), threading.Event()
     kinds = {kind for kind, name in (("depth", "depth"), ("pose", "odometry")) if name in topics}
-    joined, frames, infos = Joined(kinds), Frames(), []
+    joined, frames, infos = Joined(kinds), Frames(), Queue()
 
     def add(kind: str, message: Any) -> None:
         try:
@@ -76,16 +76,17 @@ def subscribe(words: Sequence[str], into: Newest) -> Calibration | None:
             return
         for time_s, found in joined.add(kind, stamp_of(message), value):
             given = {name: found[kind] for kind, name in GIVEN.items() if kind in found}
+            into.problem = None
             into.put(Shot(time_s, found["image"], given or None))
-
-    def learn(message: Any) -> None:
-        infos.append(message)
-        told.set()
+        if joined.num_alone > frames.num_alone:
+            frames.num_alone = joined.num_alone
+            into.problem = f"{joined.num_alone} images had no {' or '.join(sorted(kinds))} of their time"
 
     image_type = CompressedImage if topics.get("image", "").endswith("compressed") else Image
-    quality = qos_profile_sensor_data
+    quality, info_topic = qos_profile_sensor_data, node.resolve_topic_name("camera_info")
     node.create_subscription(image_type, "image", partial(add, "image"), quality)
-    node.create_subscription(CameraInfo, "camera_info", learn, quality)
+    if needs_camera:
+        node.create_subscription(CameraInfo, "camera_info", infos.put, quality)
     if "depth" in kinds:
         node.create_subscription(Image, "depth", partial(add, "depth"), quality)
     if "pose" in kinds:
@@ -100,13 +101,17 @@ def subscribe(words: Sequence[str], into: Newest) -> Calibration | None:
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     threading.Thread(target=_spin, args=(executor, node, into), name="ros", daemon=True).start()
-    if not told.wait(INFO_S):
-        into.end("ros: no camera_info")
-        topic = node.resolve_topic_name("camera_info")
+    if not needs_camera:
+        return None
+    end = time.monotonic() + INFO_S
+    while infos.empty() and into.reason is None and time.monotonic() < end:
+        time.sleep(0.05)
+    if infos.empty():
+        into.end("ended before a camera_info came")
         raise ValueError(
-            f"no CameraInfo comes on {topic} in {INFO_S:g} s: remap it (camera_info:=…), or start the camera"
+            f"no CameraInfo comes on {info_topic} in {INFO_S:g} s: remap it (camera_info:=…), give dataset.intrinsics"
         )
-    return calibration_of(infos[-1], topics.get("image", "image"), "ROS")
+    return calibration_of(infos.get(), topics.get("image", "image"), "ROS")
 
 
 def _spin(executor: Any, node: Any, into: Newest) -> None:
@@ -154,7 +159,7 @@ class Frames:
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, np.ndarray]] = {}  # of a frame, with T_parent_frame
-        self._camera: str | None = None
+        self._camera, self.num_alone = "", 0
 
     def learn(self, message: Any) -> None:
         """Take the transforms of a TFMessage on /tf_static."""
@@ -172,8 +177,10 @@ class Frames:
         value = READERS[kind](message)
         if kind == "image":
             self._camera = message.header.frame_id.lstrip("/")
-        if kind != "pose" or not self._camera or message.child_frame_id.lstrip("/") == self._camera:
+        if kind != "pose" or (self._camera and message.child_frame_id.lstrip("/") == self._camera):
             return value
+        if not self._camera:
+            raise ValueError("no image has come whose header names a frame, so what odometry moves is not known")
         (camera_root, T_root_camera), (moved_root, T_root_moved) = (
             self._above(name) for name in (self._camera, message.child_frame_id.lstrip("/"))
         )

@@ -13,11 +13,15 @@ from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.runs.finished_run import FinishedRun, read_run
 from emgs_jax.runs.repeat import check_targets
 
+CAMERA = "emgs_jax.live.camera.Camera"
+
 
 def images_of(run: FinishedRun) -> tuple[ReadableFrames | None, str]:
     """Build the data set of a run, or return why there is none; ValueError if settings name code other than ours."""
     settings, count = run.provenance["config"], len(run.poses)
     check_targets(settings["dataset"])
+    if settings["dataset"]["_target_"] == CAMERA:
+        return None, "The images are not shown: those of a camera are kept with dataset.record=true alone."
     try:
         dataset = build_dataset(OmegaConf.create(dict(settings)))
     except OmegaConfBaseException as error:  # a key that the settings of older code lack

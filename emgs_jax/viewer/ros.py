@@ -7,7 +7,7 @@ the thread of the run, between two frames, so that it never reads a map that is 
 import contextlib
 import time
 from array import array
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -20,13 +20,14 @@ from tqdm import tqdm
 from emgs_jax.drawing.colors import to_bytes
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.npz import read_npz
-from emgs_jax.live.ros import started
+from emgs_jax.live.ros import new_node
 from emgs_jax.mapping.records import UNPLACED, FrameRecord
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.ops.ranges import number
 from emgs_jax.runs.files import save_progress
 
 FRAME = "map"
+TF_AHEAD_S = 1.0  # by which map → odom is dated ahead, so that it is there when it is asked for, as AMCL does
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 ROW = np.dtype([("point", POINT), ("is_shown", bool)])
 
@@ -42,14 +43,14 @@ class RosView:
     """A node that publishes a run; `show` is called after each frame.
 
     Topics: `map` (PointCloud2: all Gaussians; who subscribes later gets the last one), `map_update` (those that the
-    last frame changed), `path`, `pose` (Odometry), `diagnostics`, and `map` → `odom` on /tf where the package tf2_msgs
-    is installed. The service `save` (Trigger) writes the map so far into the run's folder.
+    last frame changed), `path`, `pose` (Odometry), `diagnostics`, and `map` → the odometry's frame on /tf where the
+    package tf2_msgs is installed. The service `save` (Trigger) writes the map so far into the run's folder.
     """
 
-    def __init__(self, config: RosConfig, folder: Path) -> None:
-        self._rclpy, self._every_s, self._folder = started(()), config.every_s, folder
+    def __init__(self, config: RosConfig, folder: Path, words: Sequence[str], has_saved_map: bool = False) -> None:
+        self._every_s, self._folder = config.every_s, folder
+        self._rclpy, self._node = new_node("emgs_map", words)
         self._types = _types()
-        self._node = self._rclpy.create_node("emgs_map")
         make, kinds = self._node.create_publisher, self._types
         self._map = make(kinds.PointCloud2, "map", _latched())
         self._update = make(kinds.PointCloud2, "map_update", 10)
@@ -57,17 +58,21 @@ class RosView:
         self._diagnostics = make(kinds.DiagnosticArray, "diagnostics", 10)
         self._tf = None if kinds.TFMessage is None else make(kinds.TFMessage, "/tf", 10)
         self._node.create_service(kinds.Trigger, "save", self._save)
+        self._odometry_frame: str | None = None
+        if any(word.startswith("odometry:=") for word in words):
+            self._heard = self._node.create_subscription(kinds.Odometry, "odometry", self._learn, _of_sensors())
         self._run: MappingRun | None = None
         self._due, self._shown = 0.0, None
-        self._T_map_world: np.ndarray | None = None
+        self._sent: dict[int, tuple[FrameRecord, Any]] = {}  # poses of the path
+        self._T_map_world = np.eye(4) if has_saved_map else None
 
     def show(self, run: MappingRun, image: np.ndarray) -> None:
         """Publish a run after its last frame, and answer what was asked."""
         self._run = run
-        record = run.records[-1]
         if self._T_map_world is None:
-            self._T_map_world = first_odometry(run.records[0])
-        self._publish(run, record)
+            first = odometry_of(run.records[0])
+            self._T_map_world = np.eye(4) if first is None else first
+        self._publish(run, run.records[-1])
         self._rclpy.spin_once(self._node, timeout_sec=0.0)
 
     def show_last(self, run: MappingRun) -> None:
@@ -78,8 +83,11 @@ class RosView:
     def stop(self) -> None:
         """End the node."""
         self._node.destroy_node()
-        if self._rclpy.ok():
-            self._rclpy.shutdown()
+
+    def _learn(self, message: Any) -> None:
+        """Learn the odometry's frame from its first message."""
+        self._odometry_frame = message.header.frame_id
+        self._node.destroy_subscription(self._heard)
 
     def _publish(self, run: MappingRun, record: FrameRecord) -> None:
         time_s, T = record.timestamp or 0.0, self._T_map_world
@@ -88,17 +96,17 @@ class RosView:
             self._update.publish(self._cloud(changed_rows(rows, self._shown), time_s))
             self._shown = rows
             if time.monotonic() >= self._due:
-                placed = [one for one in run.records if one.status not in UNPLACED]
                 self._map.publish(self._cloud(rows[rows["is_shown"]], time_s))
-                self._path.publish(self._types.Path(header=self._header(time_s), poses=[*map(self._stamped, placed)]))
+                self._path.publish(self._types.Path(header=self._header(time_s), poses=self._placed(run)))
                 self._due = time.monotonic() + self._every_s
         if record.status not in UNPLACED:
             pose = self._types.Odometry(header=self._header(time_s), child_frame_id="camera")
             pose.pose.pose = self._as_pose(T @ record.pose)
             self._pose.publish(pose)
-            if self._tf is not None:  # T_map_odom = T_map_camera T_odom_camera⁻¹
-                drift = T @ record.pose @ np.linalg.inv(T @ record.raw_pose)
-                self._tf.publish(self._types.TFMessage(transforms=[self._transform(drift, time_s)]))
+            odometry = odometry_of(record) if self._tf is not None and self._odometry_frame else None
+            if odometry is not None:
+                drift = self._transform(T @ record.pose @ np.linalg.inv(odometry), time_s + TF_AHEAD_S)
+                self._tf.publish(self._types.TFMessage(transforms=[drift]))
         self._diagnostics.publish(self._status(run, record, time_s))
 
     def _status(self, run: MappingRun, record: FrameRecord, time_s: float) -> Any:
@@ -138,10 +146,23 @@ class RosView:
 
     def _transform(self, T_map_odom: np.ndarray, time_s: float) -> Any:
         one, pose = self._types.TransformStamped(), self._as_pose(T_map_odom)
-        one.header, one.child_frame_id, one.transform.rotation = self._header(time_s), "odom", pose.orientation
+        one.header, one.child_frame_id, one.transform.rotation = (
+            self._header(time_s),
+            self._odometry_frame,
+            pose.orientation,
+        )
         for name in "xyz":
             setattr(one.transform.translation, name, getattr(pose.position, name))
         return one
+
+    def _placed(self, run: MappingRun) -> list[Any]:
+        """The placed frames' poses; those that have not changed are sent as they are."""
+        before, self._sent = self._sent, {}
+        for record in run.records:
+            if record.status not in UNPLACED:
+                known, stamped = before.get(record.index, (None, None))
+                self._sent[record.index] = record, stamped if known is record else self._stamped(record)
+        return [stamped for _, stamped in self._sent.values()]
 
     def _stamped(self, record: FrameRecord) -> Any:
         header = self._header(record.timestamp or 0.0)
@@ -181,14 +202,21 @@ def changed_rows(rows: np.ndarray, before: np.ndarray | None) -> np.ndarray:
     return rows[rows["is_shown"] & ~same]
 
 
-def first_odometry(record: FrameRecord) -> np.ndarray:
-    """T_odom_camera (4, 4) of the first frame, from what came with its image; the identity without."""
+def odometry_of(record: FrameRecord) -> np.ndarray | None:
+    """T_odom_camera (4, 4) that came with a frame's image; None without."""
     beside = None if record.name is None else Path(record.name).with_suffix(".npz")
     if beside is None or not beside.is_file():
-        return np.eye(4)
+        return None
     with beside.open("rb") as handle:
         found = read_npz(handle, (), ("T_world_camera",)).get("T_world_camera")
-    return np.eye(4) if found is None or not np.isfinite(found).all() else found
+    return found if found is not None and np.isfinite(found).all() else None
+
+
+def _of_sensors() -> Any:
+    """Quality of topics of sensors."""
+    from rclpy.qos import qos_profile_sensor_data
+
+    return qos_profile_sensor_data
 
 
 def _latched() -> Any:
@@ -222,9 +250,11 @@ def _types() -> SimpleNamespace:
 
 
 @contextlib.contextmanager
-def ros_view(config: RosConfig, folder: Path) -> Iterator[RosView]:
-    """Publish a run during the block."""
-    view = RosView(config, folder)
+def ros_view(
+    config: RosConfig, folder: Path, words: Sequence[str] = (), has_saved_map: bool = False
+) -> Iterator[RosView]:
+    """Publish a run during the block, under the remappings `words`; a saved map is in a frame of its own."""
+    view = RosView(config, folder, words, has_saved_map)
     try:
         tqdm.write("the map is published to ROS 2: map, map_update, path, pose, diagnostics; service save")
         yield view

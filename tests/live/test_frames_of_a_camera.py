@@ -10,6 +10,7 @@ import pytest
 from emgs_jax.data.base import wait_for_all
 from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.images import Images
+from emgs_jax.data.intrinsics import Pictures, find_lens
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.live import camera, capture
 from emgs_jax.live.camera import Camera
@@ -27,7 +28,7 @@ class Source:
 
     def __init__(self, monkeypatch) -> None:
         self._given, self._next = [], threading.Semaphore(0)
-        monkeypatch.setattr(capture, "open_source", lambda source: self._shots())
+        monkeypatch.setattr(capture, "open_source", lambda source, into: self._shots())
 
     def give(self, *shots: Shot | None | Exception) -> None:
         for shot in shots:
@@ -200,25 +201,59 @@ def test_to_estimate_intrinsics_all_images_are_taken_first(source):
     assert seen == [[0, 1]] and frames.total == 2 == wait_for_all(frames) and frames.intrinsics == INTRINSICS
 
 
+BENT = (20.0, 20.0, 15.5, 11.5, -0.2, 0.05, 0.0, 0.0)  # a lens whose distortion shows in an image of 32 by 24
+RAMP = np.linspace(1, 2, 24 * 32, dtype=np.float32).reshape(24, 32)
+
+
 def test_a_recording_is_read_again_as_the_same_frames_with_what_came_beside_them(source, tmp_path):
-    given = {"depth": np.linspace(1, 2, 24 * 32, dtype=np.float32).reshape(24, 32), "T_world_camera": np.eye(4)}
-    lens = (20.0, 20.0, 15.5, 11.5, -0.2, 0.05, 0.0, 0.0)
-    source.give(Shot(1764.0, an_image(3), given))
-    frames = Camera(source="0", intrinsics=lens, record=True, folder=tmp_path)
-    source.give(Shot(1764.25, an_image(4), given), None)
+    """Without the distortion, of the images and of the depths that are registered to them."""
+    given = {"depth": RAMP, "T_world_camera": np.eye(4)}
+    image = np.repeat(np.uint8(100 * RAMP)[..., None], 3, axis=2)
+    source.give(Shot(1764.0, image, given))
+    frames = Camera(source="0", intrinsics=BENT, record=True, folder=tmp_path)
+    source.give(Shot(1764.25, image, given), None)
     assert wait_for_all(frames) == 2
     settings = frames.recording()
     assert settings.pop("_target_") == "emgs_jax.data.images.Images" and settings["root"] == str(tmp_path / "recorded")
     again = Images(**settings)
     assert len(again) == 2 and again.fingerprint() == frames.fingerprint() and again.intrinsics == frames.intrinsics
+    lens = find_lens(BENT, Pictures((32, 24), 1, lambda _: image))
     for row in range(2):
         assert again[row].timestamp == frames[row].timestamp and again[row].name == frames[row].name
         np.testing.assert_array_equal(again[row].image, frames[row].image)
-    beside = np.load(again.files(0)[0].with_suffix(".npz"))["depth"]
-    assert (beside != given["depth"]).any(), "depth is straightened with the image to which it is registered"
-    np.testing.assert_array_equal(beside, again._lens.straighten_depth(given["depth"]))
-    with pytest.raises(ValueError, match="holds an earlier recording"):
-        Camera(source="0", intrinsics=lens, record=True, folder=tmp_path)
+        np.testing.assert_array_equal(again.full(row), lens.straighten(image))
+        beside = np.load(again.files(row)[0].with_suffix(".npz"))
+        np.testing.assert_array_equal(beside["depth"], lens.straighten_depth(RAMP))
+    assert (lens.straighten_depth(RAMP) != RAMP).any()
+    with pytest.raises(ValueError, match="holds an earlier recording: map it"):
+        Camera(source="0", intrinsics=BENT, record=True, folder=tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("intrinsics", "words"),
+    [(BENT, "the depth of camera 0 has not the size of its images"), (lambda _: None, "not estimate")],
+)
+def test_depth_that_cannot_be_straightened_with_its_image_is_refused(source, intrinsics, words):
+    source.give(Shot(0.0, an_image(0), {"depth": RAMP[::2]}))
+    with pytest.raises(ValueError, match=words):
+        Camera(source="0", intrinsics=intrinsics)
+
+
+def test_a_full_disk_ends_the_camera_and_not_the_run(source, monkeypatch):
+    source.give(Shot(0.0, an_image(0)))
+    frames = Camera(source="0", intrinsics=INTRINSICS)
+    monkeypatch.setattr(camera, "atomic_write", lambda path: (_ for _ in ()).throw(OSError("no space left")))
+    source.give(Shot(1.0, an_image(1)))
+    assert not frames.has(1) and frames._newest.reason == "no space left" and frames.total == 1
+
+
+def test_times_finer_than_names_can_say_do_not_overwrite_images(source):
+    source.give(Shot(10.0000004, an_image(0)))
+    frames = Camera(source="0", intrinsics=INTRINSICS)
+    for number in (1, 2):
+        source.give(Shot(10.0000004, an_image(number)))
+        assert frames.has(number)
+    assert [int(frames[row].image[0, 0, 0]) for row in range(3)] == [0, 1, 2] and len({*frames._images}) == 3
 
 
 def test_a_clock_that_is_set_back_keeps_the_order(source):
@@ -242,8 +277,13 @@ def test_a_recorded_folder_and_a_video_are_played_at_the_pace_of_their_times(tmp
     for number in range(4):
         cv2.imwrite(str(tmp_path / f"{5 + 0.1 * number:.6f}.png"), an_image(number))
     np.savez(tmp_path / "5.100000.npz", depth=np.ones((2, 2), np.float32), other=np.zeros(1))
-    begin, shots = time.monotonic(), []
-    for shot in capture.open_source(str(tmp_path)):
+    into, shots = Newest(), []
+    waiting = capture.open_source(str(tmp_path), into)
+    shots.append((0.0, next(waiting)))
+    time.sleep(0.3)  # such as a compilation: a recording waits until images are wanted
+    into.begun.set()
+    begin = time.monotonic()
+    for shot in waiting:
         shots.append((time.monotonic() - begin, shot))
     late = [at - (shot.time - 5.0) for at, shot in shots]
     assert [int(shot.image[0, 0, 0]) for _, shot in shots] == [0, 1, 2, 3] and min(late) >= 0 and max(late) < 0.2
@@ -255,6 +295,6 @@ def test_a_recorded_folder_and_a_video_are_played_at_the_pace_of_their_times(tmp
         writer.write(an_image(80 * number))
     writer.release()
     begin, times = time.monotonic(), []
-    for shot in capture.open_source(str(path)):
+    for shot in capture.open_source(str(path), into):
         times.append((time.monotonic() - begin, shot.time))
     assert [round(found, 3) for _, found in times] == [0.0, 0.1, 0.2] and times[-1][0] >= 0.2

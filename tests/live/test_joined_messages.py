@@ -9,7 +9,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import BadFrameError
-from emgs_jax.live import joined_messages
 from emgs_jax.live.joined_messages import Joined, pose_at
 from emgs_jax.live.ros import Frames, depth_of, image_of, pose_of, stamp_of
 
@@ -30,7 +29,7 @@ def test_an_image_waits_for_its_depth_and_for_the_pose_after_it():
     joined = Joined({"depth", "pose"})
     assert not [*joined.add("pose", 0.9, at(0.0))] and not [*joined.add("image", 1.0, "a")]
     assert not [*joined.add("depth", 0.95, "of another")], "50 ms apart is another moment"
-    assert not [*joined.add("depth", 1.01, "its own")]
+    assert not [*joined.add("depth", 1.01, "its own")], "no pose has come that is later"
     ((time_s, found),) = joined.add("pose", 1.1, at(2.0, 90.0))
     assert time_s == 1.0 and found["image"] == "a" and found["depth"] == "its own"
     np.testing.assert_allclose(found["pose"], at(1.0, 45.0), atol=1e-9)
@@ -39,20 +38,51 @@ def test_an_image_waits_for_its_depth_and_for_the_pose_after_it():
 def test_what_becomes_whole_later_comes_in_order_of_time_and_what_does_not_is_counted():
     joined = Joined({"depth"})
     for number in range(4):
-        assert not [*joined.add("image", float(number), number)]
-    assert [found["image"] for _, found in joined.add("depth", 1.0, "d")] == [1]
+        assert not [*joined.add("image", 0.1 * number, number)]
+    assert [found["image"] for _, found in joined.add("depth", 0.1, "d")] == [1]
     assert joined.num_alone == 1, "the first one's depth never came"
-    joined._waiting["depth"].append((3.0, "early"))
-    assert [found["image"] for _, found in joined.add("depth", 2.0, "d")] == [2, 3]
+    joined._waiting["depth"].append((0.1 * 3, "early"))
+    assert [found["image"] for _, found in joined.add("depth", 0.1 * 2, "d")] == [2, 3]
 
 
-def test_messages_that_nothing_fits_do_not_pile_up(monkeypatch):
-    monkeypatch.setattr(joined_messages, "MAX_WAITING", 3)
+def test_an_image_does_not_take_the_depth_of_the_one_before_while_its_own_is_on_its_way():
+    """At 60 images a second the one before is within 20 ms."""
+    joined, found = Joined({"depth"}), []
+    for number in range(4):
+        found += joined.add("image", number / 60, number)
+        found += joined.add("depth", number / 60 + 0.002, number)
+    assert [(one["image"], one["depth"]) for _, one in found] == [(0, 0), (1, 1), (2, 2), (3, 3)]
+
+
+@pytest.mark.parametrize("rate", [10, 200, 1000])
+@pytest.mark.parametrize("late", [0.0, 0.35])
+def test_odometry_of_any_rate_and_depths_that_come_late_are_joined(rate, late):
+    joined, found, messages = Joined({"depth", "pose"}), [], []
+    for number in range(60):
+        messages += [(number / 30, "image", number / 30, number), (number / 30 + late, "depth", number / 30, number)]
+    messages += [(number / rate, "pose", number / rate, at(number / rate)) for number in range(3 * rate)]
+    for _, kind, time_s, value in sorted(messages, key=lambda one: one[:2]):
+        found += joined.add(kind, time_s, value)
+    assert [one["image"] for _, one in found] == [*range(60)] and joined.num_alone == 0
+    assert all(one["depth"] == one["image"] for _, one in found)
+    np.testing.assert_allclose([one["pose"][0, 3] for _, one in found], np.arange(60) / 30, atol=1e-9)
+
+
+def test_messages_that_nothing_fits_do_not_pile_up():
     joined = Joined({"depth"})
-    for number in range(10):
-        assert not [*joined.add("image", float(number), number)]
-        assert not [*joined.add("depth", number + 0.5, "of no image")]
-    assert len(joined._waiting["image"]) <= 4 and len(joined._waiting["depth"]) <= 4 and joined.num_alone >= 6
+    for number in range(1000):
+        assert not [*joined.add("image", 0.1 * number, number)]
+        assert not [*joined.add("depth", 0.1 * number + 0.05, "of no image")]
+    assert all(len(kept) <= 32 for kept in joined._waiting.values()) and joined.num_alone > 900
+
+
+def test_a_bag_that_is_played_again_begins_anew():
+    joined, found = Joined({"depth"}), []
+    for _ in range(2):
+        for number in range(100):
+            found += joined.add("depth", 0.1 * number, number)
+            found += joined.add("image", 0.1 * number, number)
+    assert [one["image"] for _, one in found] == 2 * [*range(100)]
 
 
 def test_no_pose_is_guessed_outside_of_the_list_or_in_a_large_gap():
@@ -142,6 +172,8 @@ def test_odometry_of_the_base_becomes_that_of_the_camera_where_tf_says_how_it_is
     frames, T_odom_base, T_base_mast, T_mast_camera = Frames(), *map(random_pose, range(3))
     image = message(RGB, "rgb8")
     image.header = SimpleNamespace(frame_id="camera_optical")
+    with pytest.raises(ValueError, match="no image has come whose header names a frame"):
+        frames.read("pose", odometry(T_odom_base, "base_link"))
     frames.read("image", image)
     with pytest.raises(ValueError, match="odometry is of the frame base_link, images are of camera_optical"):
         frames.read("pose", odometry(T_odom_base, "base_link"))

@@ -16,7 +16,7 @@ import pytest
 from tiny_run import TINY, dataset
 
 from emgs_jax.config import configure
-from emgs_jax.live.ros import started
+from emgs_jax.live.ros import new_node
 from experiments.cli import explained
 from experiments.command import check_arguments
 from experiments.ros import with_topics
@@ -42,7 +42,7 @@ def test_topics_are_the_source_of_a_camera_and_depth_with_odometry_is_the_prior(
 def test_a_word_that_is_no_remapping_is_named(monkeypatch):
     monkeypatch.setattr("emgs_jax.live.ros.extra", lambda *words: None)
     with pytest.raises(ValueError, match=r"picture:=/a is no remapping NAME:=TOPIC of one of image, camera_info"):
-        started(["picture:=/a"])
+        new_node("emgs", ["picture:=/a"])
 
 
 @pytest.fixture

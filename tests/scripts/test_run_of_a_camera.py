@@ -35,11 +35,11 @@ def camera(monkeypatch):
     """A camera whose next image comes when the last one has been taken; the first one comes twice."""
     newest = []
 
-    def start(source, into):
+    def start(source, into, needs_camera):
         newest.append(into)
         begin(source, into)
 
-    def one_by_one(source):
+    def one_by_one(source, into):
         first, *rest = shots()
         for shot in (first, first, *rest):
             while newest[-1]._shot is not None:
@@ -76,7 +76,7 @@ def composed(*words: str):
 
 
 def test_without_depth_and_pose_beside_its_images_a_camera_has_no_stream(tmp_path, monkeypatch):
-    monkeypatch.setattr(capture, "open_source", lambda source: (Shot(1.0, frame.image) for frame in dataset()))
+    monkeypatch.setattr(capture, "open_source", lambda source, into: (Shot(1.0, frame.image) for frame in dataset()))
     words = "dataset=camera", "dataset.source=7", "dataset.size=[64,48]", INTRINSICS, "prior=stream"
     with pytest.raises(ValueError, match=r"1.000000.npz is not beside .*choose another prior"):
         experiments.run.run(composed(*words), tmp_path)
@@ -99,7 +99,7 @@ def test_one_ctrl_c_ends_the_camera_and_the_map_is_finished(tmp_path):
     own_process.wait_for(lambda: log.exists() and len(log.read_text().splitlines()) > 8, process)
     os.kill(process.pid, signal.SIGINT)
     assert own_process.ended(process) == 0, said.read_text()
-    assert "no more images are taken: the map is finished and written" in said.read_text()
+    assert "no more images are taken; the map is finished and written" in said.read_text()
     metrics = json.loads((out / "metrics.json").read_text())
     assert 8 < metrics["frames/tracked"] < 599 and metrics["camera/num_dropped"] >= 0
     assert (out / "map.npz").is_file() and (out / "report.html").is_file() and not (out / "recorded").exists()

@@ -16,7 +16,7 @@ SUFFIXES = (".npz", ".exr", ".npy", ".png")  # the first that exists is read
 POSES = ("poses.txt", "poses.json")
 KEYS = ("depth", "points", "confidence", "intrinsics")  # of an .npz, beside the pose
 GIVES_POSES = (
-    "prior=files needs poses beside depths, and finds none itself: prior=multiview_stereo finds poses and depths from "
+    "poses are needed beside depths, and are not found here: prior=multiview_stereo finds poses and depths from "
     "the images alone, prior=mapanything by a network"
 )
 

@@ -28,7 +28,7 @@ from emgs_jax.prior.files.conventions import Sight, check_conventions
 from emgs_jax.prior.files.own import own_pose, read_npz_view
 from emgs_jax.prior.files.view import Camera, at_frame, whole_image
 
-NUM_COMPARED = 9  # views, of which the first, the middle and the last one are compared
+NUM_COMPARED, MOVED = 3, 0.05  # views that are compared; from one to the next: radians, or a share of the depth
 
 
 class Stream(Prior):
@@ -80,6 +80,9 @@ class Stream(Prior):
         covariance = equal_covariances(self._pose_std, T_anchor_view)
         return predicted(window, T_anchor_view, [*self._points.values()], pose_covariance=covariance)
 
+    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
+        """Nothing: odometry that has drifted does not measure a loop."""
+
     def _at_frame(self, path: Path, camera: Camera, is_known: bool) -> DenseView:
         """Points, confidence and mask of a frame; none is valid without a pose."""
         if not is_known:
@@ -87,12 +90,18 @@ class Stream(Prior):
         return at_frame(read_npz_view(path), camera, whole_image, self._max_depth_step)
 
     def _check_conventions(self, window: Window, pose: np.ndarray, camera: Camera) -> None:
-        """Compare the first `NUM_COMPARED` views with a pose, once they are there."""
+        """Compare the first views with a pose that has moved from one to the next, once there are enough."""
         points, _, mask = self._points[window.current]
-        if np.isfinite(pose).all():
-            self._first = [*self._first, Sight(points, mask, pose)]
+        if not np.isfinite(pose).all() or not mask.any():
+            return
+        if self._first:
+            step = np.linalg.inv(self._first[-1].T_world_camera) @ pose
+            angle = np.arccos(np.clip((np.trace(step[:3, :3]) - 1) / 2, -1, 1))
+            if np.linalg.norm(step[:3, 3]) < MOVED * np.median(points[..., 2][mask]) and angle < MOVED:
+                return
+        self._first = [*self._first, Sight(points, mask, pose)]
         if len(self._first) == NUM_COMPARED:
-            pairs = [*itertools.pairwise(self._first[:: NUM_COMPARED // 2])]
+            pairs = [*itertools.pairwise(self._first)]
             fit = check_conventions(pairs, camera.intrinsics, "T_world_camera of the stream", self._max_misfit)
             tqdm.write(f"prior=stream: {fit}")
             self._first = None
