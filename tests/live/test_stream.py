@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 import tiny_run
 
+from emgs_jax.config.configure import build_dataset
 from emgs_jax.data.backprojection import backproject
 from emgs_jax.data.base import Dataset
 from emgs_jax.prior.base import Window, calls_of
@@ -16,8 +17,8 @@ from emgs_jax.prior.files.stream import Stream
 class Beside(Dataset):
     """The tiny room, each frame with a file of its own in a folder, and its depth and pose beside it."""
 
-    def __init__(self, folder, change=lambda row, depth, pose: (depth, pose), stays: int = 0) -> None:
-        self._room, self._folder, self._stays = tiny_run.dataset(), folder, stays
+    def __init__(self, folder, change=lambda row, depth, pose: (depth, pose), stays: int = 0, room=None) -> None:
+        self._room, self._folder, self._stays = room or tiny_run.dataset(), folder, stays
         for name in ("name", "sequence", "size", "intrinsics", "classes"):
             setattr(self, name, getattr(self._room, name))
         for row in range(len(self)):
@@ -38,6 +39,11 @@ class Beside(Dataset):
 
     def __getitem__(self, index: int):
         return replace(self._at(index), index=index, name=str(self.files(index)[0]), depth=None, T_world_camera=None)
+
+
+def walk():
+    """The room from farther apart, so that the camera has moved from one frame to the next."""
+    return build_dataset(tiny_run.compose("dataset.stop=36", "dataset.stride=6"))
 
 
 def asked(data: Beside, **keys):
@@ -76,9 +82,9 @@ def test_a_frame_without_a_pose_has_no_points_and_odometry_says_nothing_of_a_loo
 @pytest.mark.parametrize("stays", [0, 10])
 def test_depths_in_another_unit_end_the_run_however_long_the_camera_stands_still(tmp_path, stays):
     with pytest.raises(ValueError, match="T_world_camera of the stream: the depths of two views differ"):
-        asked(Beside(tmp_path, lambda row, depth, pose: (3 * depth, pose), stays))
+        asked(Beside(tmp_path, lambda row, depth, pose: (3 * depth, pose), stays, walk()))
 
 
 def test_poses_in_another_convention_are_named(tmp_path):
     with pytest.raises(ValueError, match="the poses are taken as world -> camera"):
-        asked(Beside(tmp_path, lambda row, depth, pose: (depth, np.linalg.inv(pose))))
+        asked(Beside(tmp_path, lambda row, depth, pose: (depth, np.linalg.inv(pose)), room=walk()))
