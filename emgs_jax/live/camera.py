@@ -54,7 +54,7 @@ class Camera(Straightened):
     name = "camera"
 
     def __post_init__(self) -> None:
-        self._newest, self._is_over = Newest(), False
+        self._newest, self._is_over, self._is_live = Newest(), False, False
         self._images, self._times, self._arrived, self._mapped = [], [], [], []
         self.sequence, self._given = str(self.source), self.intrinsics  # `_use` replaces the latter
         if self._given == "exif" or (self._given is None and not is_ros(self.sequence)):
@@ -169,7 +169,8 @@ class Camera(Straightened):
 
     def begin(self) -> None:
         """Begin with the newest image: the first one came before the programs were compiled."""
-        is_late = len(self) == 1 and self.total is None and not self._newest.can_wait
+        self._is_live = self.total is None
+        is_late = len(self) == 1 and self._is_live and not self._newest.can_wait
         self._newest.begun.set()
         shot = self._newest.take(NEXT_S) if is_late else None
         if shot is None or shot.image.shape[1::-1] != self._raw_size:
@@ -188,6 +189,8 @@ class Camera(Straightened):
         return index
 
     def progress_words(self, index: int) -> str:
+        if not self._is_live:  # all images were taken before
+            return ""
         self._mapped.append(time.monotonic())
         recent = self._mapped[-NUM_TIMED:]
         rate = (len(recent) - 1) / max(recent[-1] - recent[0], 1e-9)
@@ -195,6 +198,8 @@ class Camera(Straightened):
         return f"{rate:.1f} maps/s, {self._newest.num_dropped} dropped, {behind:.1f} s behind"
 
     def report(self) -> dict[str, float]:
+        if not self._is_live:
+            return {}
         behind = np.array(self._mapped) - np.array(self._arrived[: len(self._mapped)])
         seconds = self._arrived[-1] - self._begin
         return {

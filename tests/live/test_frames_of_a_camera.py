@@ -93,6 +93,8 @@ def test_frames_come_one_by_one_and_their_number_is_not_known_before_the_end(sou
 def test_images_that_come_while_none_is_asked_for_are_dropped_but_for_the_newest(source):
     source.give(Shot(0.0, an_image(0)))
     frames = Camera(source="0", intrinsics=INTRINSICS, size=(32, 24))
+    assert frames.progress_words(0) == "" and frames.report() == {}, "nothing is mapped yet"
+    frames._is_live = True
     source.give(*(Shot(0.1 * number, an_image(number)) for number in range(1, 7)))
     until(lambda: frames._newest.num_dropped == 5)
     assert frames.has(1) and int(frames[1].image[0, 0, 0]) == 6
