@@ -9,7 +9,16 @@ import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.structure.config import StructureConfig
-from emgs_jax.structure.evidence import Evidence, contradicted, explained, joined, read_evidence, share, trust
+from emgs_jax.structure.evidence import (
+    MIN_MATCHES,
+    Evidence,
+    contradicted,
+    explained,
+    joined,
+    read_evidence,
+    share,
+    trust,
+)
 from emgs_jax.structure.library import bundle_of, load, options_of
 from emgs_jax.structure.mirror import only, turned_right
 from emgs_jax.structure.shots import DATABASE, IMAGES, Shots
@@ -139,8 +148,11 @@ def told_apart(found: Sequence[Any], evidence: Evidence) -> Mapped:
     """Models whose images agreeing matches join, and words on what is split, doubtful or refused."""
     models, said = [], []
     for model in found:
+        count = model.num_reg_images()
         leave_out(model, evidence)
         groups = [group for group in joined(model, evidence) if len(group) >= MIN_IMAGES]
+        if lone := count - sum(map(len, groups)):
+            said.append(f"structure: {lone} of {count} images of a model are left out: their matches contradict it")
         if len(groups) > 1:
             said.append(
                 f"structure: a model of {model.num_reg_images()} images is split into {len(groups)} (of "
@@ -150,15 +162,16 @@ def told_apart(found: Sequence[Any], evidence: Evidence) -> Mapped:
         models += [model] if is_whole else [only(model, group) for group in groups]
     believed = []
     for model in sorted(models, key=lambda model: -model.num_reg_images()):
-        trusted = trust([model], evidence, within=True)
+        trusted, count = trust([model], evidence, within=True), model.num_reg_images()
         about = (
-            f"a model of {model.num_reg_images()} images explains {100 * trusted:.0f} % of the matches that pairs of "
+            f"a model of {count} images explains {100 * trusted:.0f} % of what its images near in time explain by "
+            f"themselves (usual: 98 or more), with {model.num_points3D()} points"
         )
-        if trusted < REFUSED:
-            said.append(f"structure: {about}by themselves: it is wrong, and left out")
+        if trusted < REFUSED or model.num_points3D() < MIN_MATCHES:
+            said.append(f"structure: {about}: it is left out")
             continue
         if trusted < WEAK:
-            said.append(f"structure: doubtful: {about}by themselves (usual: 98 or more)")
+            said.append(f"structure: doubtful: {about}")
         believed.append(model)
     return Mapped(believed, said)
 

@@ -188,3 +188,17 @@ def test_the_map_of_a_database_is_right(scene, tmp_path):
     models, said = map_database(taken, structure_config(), tmp_path)
     assert models[0].num_reg_images() == NUM and said == []
     assert model.num_reg_images() == NUM
+
+
+def test_models_that_their_matches_do_not_bear_out_or_of_a_few_points_are_left_out_and_it_is_said(scene):
+    model, evidence, _ = scene
+    few = copy.deepcopy(model)
+    for key in sorted(few.points3D)[14:]:
+        few.delete_point3D(key)
+    models, said = told_apart([few], evidence)
+    assert models == [] and "8 of 8 images of a model are left out" in said[0]
+    bent = model
+    for image in sorted(model.reg_image_ids()):
+        bent = turn(bent, image, 0.5 * image)  # 4 pixels
+    models, said = told_apart([bent], evidence)
+    assert models == [] and "it is left out" in said[-1]
