@@ -25,6 +25,8 @@ from emgs_jax.mapping.records import UNPLACED, FrameRecord
 from emgs_jax.ops.camera import Camera
 from emgs_jax.slam import SlamConfig, SlamState
 
+CLOSED_AT_0 = "max_step", "max_step_rad", "max_pose_std"  # gates of localization
+
 
 @dataclass(frozen=True)
 class MappingRun:
@@ -143,6 +145,10 @@ def check_settings(config: SlamConfig) -> None:
             f"slam.motion.prior={prior:g} slam.motion.hit={look:g}: all that one earlier frame confirms would be taken "
             "for moving, and no frame be tracked: their sum must be above 0"
         )
+    gates = {f"slam.localization.{name}": getattr(config.localization, name) for name in CLOSED_AT_0}
+    gates["slam.localization.icp.max_mahalanobis_sq"] = config.localization.icp.max_mahalanobis_sq
+    if closed := [name for name, value in gates.items() if float(value) == 0]:
+        raise ValueError(f"{closed[0]}=0 lets no frame pass, so none would be tracked: give a value above 0")
     if pixels > REFERENCE:
         raise ValueError(
             f"slam.fit.points_per_gaussian={pixels} makes no Gaussian of an image, which counts as {REFERENCE} pixels "

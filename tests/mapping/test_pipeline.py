@@ -248,6 +248,9 @@ def test_a_setting_that_images_of_this_size_bound_is_named(given, is_said):
         (["slam/existence=paper", "slam.existence.refuted=1.5"], "every Gaussian would be removed"),
         (["slam/motion=default", "slam.motion.prior=-inf"], "taken for moving, and no frame be tracked"),
         (["slam/motion=default", "slam.motion.prior=-2"], "taken for moving, and no frame be tracked"),
+        (["slam.localization.max_step=0"], r"slam\.localization\.max_step=0 lets no frame pass"),
+        (["slam.localization.max_pose_std=0"], r"slam\.localization\.max_pose_std=0 lets no frame pass"),
+        (["slam.localization.icp.max_mahalanobis_sq=0"], r"icp\.max_mahalanobis_sq=0 lets no frame pass"),
         (["slam.fit.points_per_gaussian=203057"], "makes no Gaussian of an image"),
     ],
 )
