@@ -66,9 +66,10 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> Mapped:
         adjust(model, shots, config)
     models, more = told_apart(found, evidence)
     if not models:
+        known = "; its camera may be another (dataset.intrinsics=estimate)" if shots.is_calibrated else ""
         raise ValueError(
             "prior=multiview_stereo finds no structure that the images' matches agree with: what they show may repeat "
-            f"(tiles, doors) or move; take images closer together, or bring predictions (prior=files). {' '.join(more)}"
+            f"(tiles, doors) or move{known}; or bring predictions (prior=files). {' '.join(more)}"
         )
     return Mapped(models, said + more)
 
