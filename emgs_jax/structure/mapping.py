@@ -38,6 +38,7 @@ MAX_FOR_STARTS = 200  # images up to which a weak structure is begun anew
 WEAK = 0.96  # of the matches that pairs alone explain: models that are right explain .97 and more
 REFUSED = 0.7  # of them, below which a model is not believed
 WORSE = 0.03  # of them, by which the start with the most matches explained may be worse than another
+MIN_DOUBTFUL = 10  # images of a doubtful model that is kept: COLMAP's own least size of a model
 MIN_IMAGES = 3  # of a model, that no larger one holds
 MIN_FOR_CENTER = 30  # images to refine the principal point
 MIN_DEPTH = 0.01  # of a point, in median depths of the image
@@ -66,9 +67,10 @@ def map_database(shots: Shots, config: StructureConfig, folder: Path) -> Mapped:
         adjust(model, shots, config)
     models, more = told_apart(found, evidence)
     if not models:
+        known = "; its camera may be another (dataset.intrinsics=estimate)" if shots.is_calibrated else ""
         raise ValueError(
             "prior=multiview_stereo finds no structure that the images' matches agree with: what they show may repeat "
-            f"(tiles, doors) or move; take images closer together, or bring predictions (prior=files). {' '.join(more)}"
+            f"(tiles, doors) or move{known}; or bring predictions (prior=files). {' '.join(more)}"
         )
     return Mapped(models, said + more)
 
@@ -167,7 +169,8 @@ def told_apart(found: Sequence[Any], evidence: Evidence) -> Mapped:
             f"a model of {count} images explains {100 * trusted:.0f} % of what its images near in time explain by "
             f"themselves (usual: 98 or more), with {model.num_points3D()} points"
         )
-        if trusted < REFUSED or model.num_points3D() < MIN_MATCHES:
+        is_small = model.num_points3D() < MIN_MATCHES or (trusted < WEAK and count < MIN_DOUBTFUL)
+        if trusted < REFUSED or is_small:
             said.append(f"structure: {about}: it is left out")
             continue
         if trusted < WEAK:

@@ -20,9 +20,10 @@ from emgs_jax.structure.evidence import (
     trust,
 )
 from emgs_jax.structure.mapping import map_database, settle, told_apart
+from emgs_jax.structure.mirror import only
 from emgs_jax.structure.shots import DATABASE
 
-NUM, NOISE = 8, 0.3
+NUM, NOISE = 12, 0.3
 
 
 @pytest.fixture(scope="module")
@@ -78,9 +79,9 @@ def test_images_that_no_agreeing_match_joins_are_models_of_their_own_and_it_is_s
     model, evidence, _ = scene
     images = sorted(model.reg_image_ids())
     moved = model
-    for image in images[4:]:  # each half is right, and they are apart
+    for image in images[NUM // 2 :]:  # each half is right, and they are apart
         moved = turn(moved, image, 0)
-    half = {*images[:4]}
+    half = {*images[: NUM // 2]}
     keep = [row for row, (a, b) in enumerate(evidence.pairs) if (a in half) == (b in half)]
     cut = evidence._replace(
         pairs=[evidence.pairs[row] for row in keep],
@@ -89,15 +90,15 @@ def test_images_that_no_agreeing_match_joins_are_models_of_their_own_and_it_is_s
         is_near=evidence.is_near[keep],
     )
     models, said = told_apart([moved], cut)
-    assert [sorted(one.reg_image_ids()) for one in models] == [images[:4], images[4:]]
-    assert len(said) == 1 and "a model of 8 images is split into 2 (of 4, 4)" in said[0]
+    assert [sorted(one.reg_image_ids()) for one in models] == [images[: NUM // 2], images[NUM // 2 :]]
+    assert len(said) == 1 and "a model of 12 images is split into 2 (of 6, 6)" in said[0]
 
 
 def test_a_model_that_explains_little_is_doubtful(scene):
     model, evidence, _ = scene
     wrong = turn(model, sorted(model.reg_image_ids())[2], 0.4)  # 3.5 pixels
-    _, said = told_apart([wrong], evidence)
-    assert len(said) == 1 and "doubtful: a model of 8 images explains" in said[0]
+    models, said = told_apart([wrong], evidence)
+    assert models == [wrong] and len(said) == 1 and "doubtful: a model of 12 images explains" in said[0]
 
 
 def far(count=6, distance=8.0):
@@ -196,7 +197,10 @@ def test_models_that_their_matches_do_not_bear_out_or_of_a_few_points_are_left_o
     for key in sorted(few.points3D)[14:]:
         few.delete_point3D(key)
     models, said = told_apart([few], evidence)
-    assert models == [] and "8 of 8 images of a model are left out" in said[0]
+    assert models == [] and "12 of 12 images of a model are left out" in said[0]
+    few = only(turn(model, 3, 0.4), sorted(model.reg_image_ids())[:6])
+    models, said = told_apart([few], evidence)  # doubtful, and small
+    assert models == [] and "a model of 6 images explains" in said[0] and "it is left out" in said[0]
     bent = model
     for image in sorted(model.reg_image_ids()):
         bent = turn(bent, image, 0.5 * image)  # 4 pixels

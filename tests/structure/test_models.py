@@ -99,6 +99,7 @@ def given(tmp_path):
     """The synthetic images, and a function that names a model of theirs."""
     whole = scene()
     taken = shots([None] * NUM_FRAMES, names=names_of(whole))
+    taken = taken._replace(camera=("SIMPLE_RADIAL", (200.0, 80.0, 60.0, 0.05)))  # the scene's, at the size of these
     return whole, taken, lambda path: given_models(path, taken, structure_config(f"prior.structure.model='{path}'"))
 
 
@@ -128,6 +129,16 @@ def test_a_database_is_mapped_and_stays_as_it_is(tmp_path, given):
     (found,) = models(tmp_path)
     assert found.num_reg_images() == NUM_FRAMES and models(tmp_path / DATABASE)
     assert (tmp_path / DATABASE).read_bytes() == before and len([*tmp_path.iterdir()]) == 1
+
+
+@pytest.mark.slow
+def test_a_camera_that_is_wrong_is_named_where_no_model_agrees_with_the_matches(tmp_path, given):
+    whole, taken, _ = given
+    with pycolmap.Database.open(tmp_path / DATABASE) as database:
+        scene(database=database)
+    wrong = taken._replace(camera=("SIMPLE_RADIAL", (131.2, 80.0, 60.0, 0.0)))
+    with pytest.raises(ValueError, match="its camera may be another .dataset.intrinsics=estimate"):
+        given_models(tmp_path / DATABASE, wrong, structure_config(f"prior.structure.model='{tmp_path}'"))
 
 
 @pytest.mark.parametrize("name", ["cameras", "images", "points3D", "rigs", "frames"])
