@@ -11,6 +11,7 @@ from scene import same_bits, slam_config
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, EditedPrior, at_inference, compose, dataset, exact, map_tiny
 
 from emgs_jax.config.configure import build
+from emgs_jax.data.base import Dataset
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.data.spool import Spool
 from emgs_jax.device.clock import Clock
@@ -28,7 +29,7 @@ from emgs_jax.runs.metrics import new_scorer, score_map, score_prior
 pytestmark = pytest.mark.xdist_group("tiny")
 
 
-class Counting:
+class Counting(Dataset):
     """A data set that counts how often each frame is read."""
 
     def __init__(self, num_frames: int) -> None:

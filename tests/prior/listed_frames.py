@@ -2,8 +2,10 @@
 
 from dataclasses import replace
 
+from emgs_jax.data.base import Dataset
 
-class Listed:
+
+class Listed(Dataset):
     def __init__(self, like, frames):
         self.name, self.sequence, self.size = like.name, "listed", like.size
         self.intrinsics, self.classes, self.has_ground_truth = like.intrinsics, (), True
