@@ -52,7 +52,7 @@ class Dataset(Protocol):
     calibration: Mapping[str, Any] = MappingProxyType({})  # origin of `intrinsics` for metrics.json, `note` for people
     full_intrinsics: tuple[float, float, float, float] | None = None  # of `full`; None if it is the frame's image
     classes: tuple[str, ...] = ()  # names of the labels
-    every: Sequence[str] = ()  # names without suffix of all images, in use or not; empty if not known
+    all_names: Sequence[str] = ()  # names without suffix of all images, in use or not; empty if not known
     is_turned: bool = True  # images are shown as their EXIF turns them; False: as they are stored
     has_ground_truth: bool = False  # depth and poses
 

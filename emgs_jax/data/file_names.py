@@ -160,19 +160,19 @@ def last_number(name: str) -> int | float | None:
     return float(found[-1]) if "." in found[-1] or len(found[-1]) > 300 else int(found[-1])
 
 
-def check_numbering(every: Collection[str], used: Collection[str], given: Collection[str], where: object) -> None:
+def check_numbering(all_names: Collection[str], used: Collection[str], given: Collection[str], where: object) -> None:
     """Raise ValueError if names are those of images but for the first number, such as 0 and ffmpeg's 1.
 
     Each would be taken for its neighbour's. They are if all are one off, and one of them is of no image; or if they are
     those of the images in use, one off.
 
     Args:
-        every: names of all images, without suffix; empty if not known.
+        all_names: names of all images, without suffix; empty if not known.
         used: names of the images in use.
         given: names of masks, poses or predictions, in `where`.
     """
     others = _numbers(given)
-    for names, is_all in ((every, False), (used, True)):
+    for names, is_all in ((all_names, False), (used, True)):
         for kind, numbers in _numbers(names).items():
             found = others.get(kind, {})
             off = (found.keys() - {number + step for number in numbers} for step in (1, -1))

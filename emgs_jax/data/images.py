@@ -52,7 +52,7 @@ class Images(Straightened):
         else:
             self._folder, (paths, times, notes) = path, listed(path)
         self._select(len(paths), f"{path} ({LAYOUT})")
-        self.every = (
+        self.all_names = (
             [frame_name(row) for row in range(self._video.count)] if self._video else [one.stem for one in paths]
         )
         self._images, self._times = ([every[row] for row in self._chosen] for every in (paths, times))

@@ -188,7 +188,7 @@ def files_of(dataset: Dataset) -> tuple[list[Path | None], list[int]]:
 def check_names(dataset: Dataset, given: Collection[str], where: object) -> None:
     """Raise ValueError if `given`, names of images without suffix in `where`, are those of each frame's neighbour."""
     used = names_of(dataset)
-    check_numbering([stem(f"{name}.png") for name in getattr(dataset, "every", ())], used, given, where)
+    check_numbering([stem(f"{name}.png") for name in getattr(dataset, "all_names", ())], used, given, where)
     first, second = map(frame_name, (0, 1))
     if files_of(dataset)[0][0] is None and first in used and first not in given and second in given:
         raise ValueError(

@@ -47,7 +47,7 @@ class ReadableFrames:
         self._spool, self._places = Spool(), {}  # frames without arrays, and the arrays' positions
         for name in ("name", "sequence", "size", "intrinsics", "calibration", "classes", "has_ground_truth"):
             setattr(self, name, getattr(dataset, name))
-        self.every = getattr(dataset, "every", ())
+        self.all_names = getattr(dataset, "all_names", ())
         self.full_intrinsics = getattr(dataset, "full_intrinsics", None)
         self._grows, indices = dataset.total is None, range(len(dataset))
         if self._grows and masks.folder is not None:

@@ -35,7 +35,7 @@ def rows_of(
     if len(best) > 1:
         raise ValueError(f"{folder} has files of several kinds for each frame, *{', *'.join(best)}: leave one kind")
     found = [stem + best[0] for stem in stems]
-    check_numbering([f"{name}{best[0]}" for name in getattr(dataset, "every", ())], found, names, folder)
+    check_numbering([f"{name}{best[0]}" for name in getattr(dataset, "all_names", ())], found, names, folder)
     if twice := [name for name, count in Counter(names).items() if count > 1 and name in found]:
         raise ValueError(
             f"{folder} has several predictions of the name {twice[0]}, of which one is of the frame: give images and "
