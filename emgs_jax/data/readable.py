@@ -12,7 +12,7 @@ import numpy as np
 
 from emgs_jax.data.base import BadFrameError, Dataset, Frame
 from emgs_jax.data.masks import MANY, Masks, check_names, files_of, masked, stem
-from emgs_jax.data.reading import read_bytes
+from emgs_jax.data.reading import is_turned_unseen, read_bytes
 from emgs_jax.data.spool import Spool
 
 MAX_KEPT_BYTES = 2**30  # of cached frames, uncompressed; others are read again
@@ -134,8 +134,16 @@ class ReadableFrames:
         own = [index for index in self.kept if self._mask_files[index] is not None]
         share = np.mean([self._left_out(index, self.size).mean() for index in own[:: len(own) // 5 + 1]])
         note = f"masks of {len(own)} of {len(self.kept)} frames leave out {100 * share:.0f} % of the images"
-        advice = "black is left out, white is kept: if yours are white where something is to be left out, invert them"
-        return note if share <= MANY else f"{note}; {advice}"
+        if share > MANY:
+            note += "; black is left out, white is kept: invert yours if they are white where something is left out"
+        images = [self._mask_files[index][1] for index in own if getattr(self._dataset, "is_turned", True)]
+        turned = next((image for image in images if image and is_turned_unseen(image)), None)
+        if turned is not None:
+            note += (
+                f"; {turned.name} is shown turned by its EXIF in a way that the sides of a mask do not tell: masks are "
+                "taken as of the image as it is shown; turn those of the stored pixels"
+            )
+        return note
 
     @staticmethod
     def _files_of_masks(dataset: Dataset, masks: Masks, may_lack: bool) -> list[tuple[Path, Path | None] | None]:

@@ -253,6 +253,15 @@ def orientation(path: Path) -> int:
     return found if found in range(2, 9) else 1
 
 
+def is_turned_unseen(path: Path) -> bool:
+    """Test whether EXIF turns an image without changing its sides: mirrored, upside down, or square."""
+    turn = orientation(path)
+    if turn == 1:
+        return False
+    with Image.open(path) as image:
+        return turn < 5 or image.width == image.height
+
+
 def other_kind(data: bytes) -> str | None:
     """Name the kind of a file that OpenCV cannot decode, by its content; None if unknown."""
     if data[4:8] == b"ftyp":

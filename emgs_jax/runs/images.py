@@ -21,17 +21,17 @@ def images_of(run: FinishedRun) -> tuple[ReadableFrames | None, str]:
     settings, count = run.provenance["config"], len(run.poses)
     check_targets(settings["dataset"])
     if settings["dataset"]["_target_"] == CAMERA:
-        return None, "The images are not shown: those of a camera are kept with dataset.record=true alone."
+        return None, "The images are not available: those of a camera are kept with dataset.record=true alone."
     try:
         dataset = build_dataset(OmegaConf.create(dict(settings)))
     except OmegaConfBaseException as error:  # a key that the settings of older code lack
-        return None, f"The images are not shown: the run is of another version ({str(error).splitlines()[0]})."
+        return None, f"The images are not available: the run is of another version ({str(error).splitlines()[0]})."
     except (ValueError, OSError, InstantiationException) as error:
-        return None, f"The images are not shown: {message_of(error)}"
+        return None, f"The images are not available: {message_of(error)}"
     if len(dataset) != count:
-        return None, f"The images are not shown: there are {len(dataset)} now, and {count} were mapped."
+        return None, f"The images are not available: there are {len(dataset)} now, and {count} were mapped."
     if dataset.fingerprint() != run.provenance["data"]["fingerprint"]:
-        return None, "The images are not shown: they are not those that were mapped."
+        return None, "The images are not available: they are not those that were mapped."
     return dataset, ""
 
 

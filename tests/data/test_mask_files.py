@@ -42,7 +42,7 @@ def write(path: Path, image: np.ndarray, orientation: int = 1) -> str:
     path.parent.mkdir(parents=True, exist_ok=True)
     exif = Image.Exif()
     exif[0x0112] = orientation
-    stored = {1: image, 6: np.rot90(image, 1), 8: np.rot90(image, 3)}[orientation]
+    stored = np.rot90(image, {1: 0, 3: 2, 6: 1, 8: 3}[orientation])
     Image.fromarray(np.ascontiguousarray(stored)).save(
         path, **({"exif": exif, "quality": 98} if orientation > 1 else {})
     )
@@ -273,3 +273,11 @@ def test_a_mask_is_read_as_programs_write_it_and_what_is_no_image_is_left(tmp_pa
     masks = Masks(str(tmp_path), border=0)
     found = masks.decoded(*masks.files([Path("x/a.png")], [0]), (WIDTH, HEIGHT))
     assert np.mean(found != block(3)) <= (0.03 if kind == "JPEG" else 0)
+
+
+@pytest.mark.parametrize(("orientation", "is_said"), [(1, False), (6, False), (3, True)])
+def test_where_the_sides_of_a_mask_do_not_tell_a_turn_it_is_said_how_masks_are_taken(tmp_path, orientation, is_said):
+    """An image that is upside down has the sides of one that is not: its mask was taken for either without a word."""
+    data = photos(tmp_path / "images", tmp_path / "masks", orientation=orientation)
+    note = ReadableFrames(data, masks=Masks(str(tmp_path / "masks"))).mask_note
+    assert ("masks are taken as of the image as it is shown" in note) == is_said

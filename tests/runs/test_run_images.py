@@ -14,4 +14,4 @@ def test_images_that_are_gone_are_said_and_stop_nothing(tmp_path):
     settings = OmegaConf.to_container(compose(*words), resolve=True)
     dataset, note = images_of(SimpleNamespace(provenance={"config": settings}, poses=[None] * 3))
     assert dataset is None
-    assert note.startswith(f"The images are not shown: dataset.root={tmp_path}/gone does not exist")
+    assert note.startswith(f"The images are not available: dataset.root={tmp_path}/gone does not exist")

@@ -94,7 +94,9 @@ def misfit(
     if known.sum() < MIN_SHARED:
         return np.inf
     ratios = points[inside, 2][known] / a.points[rows, columns, 2][known]
-    logs = np.log(ratios)
+    logs = np.log(ratios[ratios > 0])  # a reading may have put points behind the camera
+    if len(logs) < MIN_SHARED:
+        return np.inf
     return float(np.median(np.abs(logs - np.median(logs) if has_own_scales else logs)))
 
 

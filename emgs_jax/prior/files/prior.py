@@ -61,6 +61,7 @@ SCALES = ("auto", "metric", "arbitrary")
 TURNS = {3: [[-1, 0], [0, -1]], 6: [[0, 1], [-1, 0]], 8: [[0, -1], [1, 0]]}  # R_stored_shown of an EXIF orientation
 FOCAL_NOTE, FOCAL_ERROR = 1.03, 1.5  # ratio of the files' focal length and the data set's
 NUM_CAMERAS = 16  # views whose intrinsics are looked at for the camera of the images
+TURNED, FITS = np.radians(1.0), 0.01  # poses so wrong cannot have depths that fit so well
 NUM_PAIRS, PAIR_GAP = 5, 5  # of views that are compared, and how many frames apart they are
 
 
@@ -139,6 +140,15 @@ class Files(Prior):
         if not np.isfinite(median_misfit(pairs, dataset.intrinsics, lambda sight: sight)):  # the camera turns fast
             pairs = self._pairs(known, camera, gap=1) or pairs
         fit = check_conventions(pairs, dataset.intrinsics, found.pose_source, self._max_misfit)
+        if (
+            angle is not None
+            and angle > TURNED
+            and median_misfit(pairs, dataset.intrinsics, lambda sight: sight) < FITS
+        ):
+            fit += (
+                f", but by the images the poses are off by {np.degrees(angle):.1f} degrees: such files fit each other "
+                "and not the images, as where they are in another order; check which file is of which image"
+            )
         tqdm.write(
             f"prior=files: {self.folder}, layout {found.layout}, {scale}{lacking}; {fit}, "
             f"{_pose_note(self._pose_std)}{unread}{note}"

@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 from emgs_jax.config.configure import build_dataset, compose
 from emgs_jax.prior.files import pose_error
 from emgs_jax.prior.files.pose_error import calibration, pair_error, pose_angle, sampson
-from emgs_jax.prior.files.prior import _stored_words
+from emgs_jax.prior.files.prior import Files, _stored_words
 
 pytestmark = pytest.mark.slow
 
@@ -105,3 +105,18 @@ def test_poses_of_images_as_they_are_stored_are_told_from_those_as_they_are_show
     words = _stored_words(Frames(), of_stored, turned, pose_angle(Frames(), of_stored))
     assert "a.jpg is shown turned by its EXIF orientation" in words
     assert _stored_words(Frames(), shown, turned, pose_angle(Frames(), shown)) is None
+
+
+def test_files_in_another_order_than_the_images_fit_each_other_and_are_said_not_to_fit_those(tmp_path, capsys):
+    """Each image had the depth and pose of another: depths of two views agreed, and nothing was said."""
+    dataset = build_dataset(compose("dataset.stop=12"))
+    for name, order in (("right", range(12)), ("reversed", range(11, -1, -1))):
+        (tmp_path / name).mkdir()
+        for row, other in enumerate(order):
+            frame = room().frames[other]
+            given = {"depth": frame.depth, "T_world_camera": frame.T_world_camera}
+            np.savez(tmp_path / name / f"{row:06d}.npz", **given)
+        keys = {"scale": "auto", "median_depth": 2.0, "depth_scale": 1000.0, "max_depth_step": 0.03}
+        Files(tmp_path / name, **keys).check(dataset, 4)
+        said = capsys.readouterr().out
+        assert ("check which file is of which image" in said) == (name == "reversed")
