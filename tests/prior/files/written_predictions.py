@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import tiny_run
 
-from emgs_jax.data.base import Frame
+from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.prior.base import PriorPrediction, windows
 from emgs_jax.prior.files.prior import Files
 
@@ -22,7 +22,7 @@ KEYS = {
 }
 
 
-class Named:
+class Named(Dataset):
     """The frames of the tiny room as if they were of images on disk, whose names need not be there."""
 
     def __init__(self, suffix: str = ".jpg", names: list[str] | None = None) -> None:
