@@ -55,8 +55,13 @@ class Joined:
 
     def _found(self, time_s: float) -> dict[str, Any] | None:
         """What belongs to an image of this time; None if something has not come yet."""
-        found = {kind: FIND[kind](self._waiting[kind], time_s) for kind in self._kinds}
-        return None if any(value is None for value in found.values()) else found
+        found = {}
+        for kind in sorted(self._kinds):  # a pose between two takes long, and odometry comes often
+            value = FIND[kind](self._waiting[kind], time_s)
+            if value is None:
+                return None
+            found[kind] = value
+        return found
 
 
 def nearest(kept: list[tuple[float, Any]], time_s: float) -> Any | None:

@@ -41,7 +41,7 @@ DATA_LICENCES = {
     "euroc": "EuRoC MAV: see the data set's page at ETH Zurich; another folder of this layout: see its publisher",
     "kitti": "KITTI: CC BY-NC-SA 3.0",
     "replica": "Replica: Replica Dataset Research Terms, for research and education that is not commercial",
-    **dict.fromkeys(("images", "colmap", "nerfstudio", "rosbag"), "your own images, your own licence"),
+    **dict.fromkeys(("images", "camera", "colmap", "nerfstudio", "rosbag"), "your own images, your own licence"),
 }
 
 

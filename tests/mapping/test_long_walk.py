@@ -12,7 +12,7 @@ import pytest
 from tiny_run import compose
 
 from emgs_jax.config.configure import build
-from emgs_jax.data.base import Frame
+from emgs_jax.data.base import Dataset, Frame
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.device.clock import Clock
 from emgs_jax.mapping.pipeline import finish_run, map_frames
@@ -38,7 +38,7 @@ def to_and_fro(index: int) -> int:
     return min(index % lap, lap - index % lap)
 
 
-class ToAndFro:
+class ToAndFro(Dataset):
     """A data set of so many frames, each from a place on the path of the room and changed by a scene."""
 
     name, has_ground_truth, files = "to_and_fro", True, lambda self, index: ()

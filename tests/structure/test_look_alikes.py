@@ -40,6 +40,7 @@ def test_doors_that_look_alike_are_not_taken_for_each_other(tmp_path):
     assert error(first[0], shots.names, truth) > 0.1, "the case"
 
 
+@pytest.mark.weekly
 def test_of_white_tiles_what_is_placed_is_right_or_nothing_is(tmp_path):
     shots, truth = corridor("tiles")
     try:
