@@ -173,12 +173,14 @@ class Camera(Straightened):
         is_late = len(self) == 1 and self._is_live and not self._newest.can_wait
         self._newest.begun.set()
         shot = self._newest.take(NEXT_S) if is_late else None
+        self._begin = time.monotonic()
         if shot is None or shot.image.shape[1::-1] != self._raw_size:
+            self._arrived[0] = self._begin  # a recording has waited
             return
         for path in (self._images[0], self._images[0].with_suffix(".npz")):
             path.unlink(missing_ok=True)
         self._images, self._times, self._arrived = [], [], []
-        self._begin, self._newest.num_dropped = shot.arrived, 0
+        self._newest.num_dropped = 0
         self._add(shot)
 
     @property
