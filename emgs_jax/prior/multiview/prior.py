@@ -71,7 +71,7 @@ class MultiviewStereo(Prior):
     def __init__(self, structure: StructureConfig, dense: AnyDense) -> None:
         self._config, self._dense, self._way = structure, dense, way_of(dense)
         settings = {"structure": _values(structure), "dense": _described(dense, self._way)}
-        self.provenance = Provenance("multiview_stereo", {"version": 13} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 14} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
         self._found: Structure | None = None
