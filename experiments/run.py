@@ -47,7 +47,7 @@ from emgs_jax.runs.metrics import (
     spent,
 )
 from emgs_jax.runs.polished import OPTAX, polish
-from emgs_jax.runs.provenance import is_metric, provenance, signature, write_metrics
+from emgs_jax.runs.provenance import described, is_metric, provenance, signature, write_metrics
 from emgs_jax.viewer.live import LiveView, live_view
 from emgs_jax.viewer.ros import RosConfig, RosView, ros_view
 
@@ -109,7 +109,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         dataset.begin()
         session, raw = _map(session, dataset, prior, (baselines, evaluation, keeps_points), folder, keeper, live)
         if is_live:  # all its frames are known now
-            origin = origin | {"data": provenance(settings, dataset, prior.provenance)["data"]}
+            origin["data"] = described(dataset)
         origin["config"] |= {"dataset": dataset.recording() or settings["dataset"]}
         # The raw prior is scored while the map is drawn and written.
         with ThreadPoolExecutor(2, "raw prior") as threads:

@@ -222,9 +222,6 @@ class Camera(Straightened):
         """Hex digest of the frames so far, as of a folder of images."""
         return Images(str(self._folder), size=self.size, intrinsics=self._given).fingerprint()
 
-    def _place(self, index: int) -> tuple[float, str]:
-        return self._times[index], str(self._images[index])
-
 
 def as_words(size: Size) -> str:
     """Name images by their (width, height)."""

@@ -69,6 +69,7 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
     joined, frames, infos = Joined(kinds), Frames(), Queue()
 
     def add(kind: str, message: Any) -> None:
+        num_alone = joined.num_alone
         try:
             value = frames.read(kind, message)
         except (BadFrameError, ValueError) as error:
@@ -78,8 +79,7 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
             given = {name: found[kind] for kind, name in GIVEN.items() if kind in found}
             into.problem = None
             into.put(Shot(time_s, found["image"], given or None))
-        if joined.num_alone > frames.num_alone:
-            frames.num_alone = joined.num_alone
+        if joined.num_alone > num_alone:
             into.problem = f"{joined.num_alone} images had no {' or '.join(sorted(kinds))} of their time"
 
     image_type = CompressedImage if topics.get("image", "").endswith("compressed") else Image
@@ -159,7 +159,7 @@ class Frames:
 
     def __init__(self) -> None:
         self._parents: dict[str, tuple[str, np.ndarray]] = {}  # of a frame, with T_parent_frame
-        self._camera, self.num_alone = "", 0
+        self._camera = ""
 
     def learn(self, message: Any) -> None:
         """Take the transforms of a TFMessage on /tf_static."""

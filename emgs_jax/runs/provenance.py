@@ -43,19 +43,24 @@ def provenance(config: Mapping[str, Any], dataset: Dataset, prior: Provenance) -
         "protocol": config.get("evaluation", {}).get("protocol"),
         "simulated": prior.is_simulated,
         "prior": {"name": prior.name, "settings": prior.settings},
-        "data": {
-            "name": dataset.name,
-            "sequence": dataset.sequence,
-            "fingerprint": dataset.fingerprint(),
-            "camera": dict(dataset.calibration),  # of the images on disk
-            "frames": {"size": [*dataset.size], "intrinsics": [*map(float, dataset.intrinsics)]},
-        },
+        "data": described(dataset),
         "seed": prior.settings.get("seed", 0),
         "git": git_now(),
         "versions": {"python": platform.python_version()} | {k: _version(names) for k, names in _PACKAGES.items()},
         "device": {"kind": device.device_kind, "backend": device.platform, "cpu_count": os.cpu_count()},
         "platform": platform.platform(),
         "config": config,
+    }
+
+
+def described(dataset: Dataset) -> dict[str, Any]:
+    """Describe the frames of a data set, of a camera's those so far."""
+    return {
+        "name": dataset.name,
+        "sequence": dataset.sequence,
+        "fingerprint": dataset.fingerprint(),
+        "camera": dict(dataset.calibration),  # of the images on disk
+        "frames": {"size": [*dataset.size], "intrinsics": [*map(float, dataset.intrinsics)]},
     }
 
 

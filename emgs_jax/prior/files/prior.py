@@ -137,14 +137,12 @@ class Files(Prior):
         except ValueError as error:
             raise ValueError(f"{error}{_turned_note(turned)}") from error
         pairs = self._pairs(known, camera)
-        if not np.isfinite(median_misfit(pairs, dataset.intrinsics, lambda sight: sight)):  # the camera turns fast
+        misfit = median_misfit(pairs, dataset.intrinsics, lambda sight: sight)
+        if not np.isfinite(misfit):  # the camera turns fast
             pairs = self._pairs(known, camera, gap=1) or pairs
+            misfit = median_misfit(pairs, dataset.intrinsics, lambda sight: sight)
         fit = check_conventions(pairs, dataset.intrinsics, found.pose_source, self._max_misfit)
-        if (
-            angle is not None
-            and angle > TURNED
-            and median_misfit(pairs, dataset.intrinsics, lambda sight: sight) < FITS
-        ):
+        if angle is not None and angle > TURNED and misfit < FITS:
             fit += (
                 f", but by the images the poses are off by {np.degrees(angle):.1f} degrees: such files fit each other "
                 "and not the images, as where they are in another order; check which file is of which image"
