@@ -17,6 +17,7 @@ from emgs_jax.config.overrides import readable
 from experiments.command import check_arguments
 from experiments.evaluate import delegated
 from experiments.ros import with_topics
+from experiments.shorthand import CAMERA, of_camera
 
 ROOT = CONF.parent
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
@@ -75,7 +76,9 @@ def commands(page: Path) -> set[tuple[str, ...]]:
         if re.match(r"\s*emgs [a-z]", part) and "$PWD" not in part:
             _, name, *words = shlex.split(part, comments=True)
             given = [word for word in words if "=" in word and "…" not in word]
-            if name == "run" and words and re.fullmatch(r"[\w/.]+", words[0]):  # what a video stands for
+            if name == "run" and words and CAMERA.match(words[0]):
+                given = of_camera(words[0], given)
+            elif name == "run" and words and re.fullmatch(r"[\w/.]+", words[0]):  # what a video stands for
                 given = ["dataset=images", "prior=multiview_stereo", *given]
             if name == "ros":
                 given = with_topics(given)
