@@ -109,6 +109,10 @@ class Dataset(Protocol):
         """Return a mask (h, w) of image `index` as it is on disk as one of its `full` image."""
         return mask
 
+    def pixel_of(self, index: int, pixel: np.ndarray) -> np.ndarray:
+        """Return the column and row, in frame `index`, of a pixel (column, row) of its image on disk."""
+        return (np.asarray(pixel, np.float64) + 0.5) * self.size / self.raw_size - 0.5
+
     @property
     def raw_size(self) -> tuple[int, int]:
         """(width, height) of the images on disk."""

@@ -70,6 +70,14 @@ class Lens:
         """Undistort depth that is registered to the image, by the nearest, as depths must not be mixed."""
         return depth if self.maps is None else cv2.remap(depth, *self.maps, cv2.INTER_NEAREST)
 
+    def straight_pixel(self, pixel: Sequence[float]) -> np.ndarray:
+        """The pixel (column, row) of the undistorted image that is nearest to one of the distorted image."""
+        if self.maps is None:
+            return np.asarray(pixel, np.float64)
+        off = (self.maps[0] - pixel[0]) ** 2 + (self.maps[1] - pixel[1]) ** 2
+        row, column = np.unravel_index(np.argmin(off), off.shape)
+        return np.array([column, row], np.float64)
+
 
 def pictures_of(files: Sequence[Path], size: Size, tones: Tones | None = None) -> Pictures:
     """Image files of one size; `tones` of those with more than 8 bits."""

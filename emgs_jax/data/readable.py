@@ -129,6 +129,10 @@ class ReadableFrames:
         """What is left out of `full`, bool (h, w); None without a mask."""
         return self._left_out(self.kept[index], self.size if self.full_intrinsics is None else self._dataset.raw_size)
 
+    def pixel_of(self, index: int, pixel: np.ndarray) -> np.ndarray:
+        """The column and row, in frame `index`, of a pixel of its image on disk."""
+        return self._dataset.pixel_of(self.kept[index], pixel)
+
     def _mask_note(self) -> str:
         """Say of how many frames there are masks, and how much some of these leave out."""
         own = [index for index in self.kept if self._mask_files[index] is not None]

@@ -78,6 +78,9 @@ class Straightened(Dataset):
     def straight(self, index: int, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
         return self._lens_at(index).straighten_mask(mask)
 
+    def pixel_of(self, index: int, pixel: np.ndarray) -> np.ndarray:
+        return super().pixel_of(index, self._lens_at(index).straight_pixel(pixel))
+
     def _lens_at(self, index: int) -> Lens:
         return self._lens if self._cameras is None else self._lens_of(self._cameras[index])
 

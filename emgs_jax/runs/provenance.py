@@ -109,6 +109,8 @@ def write_metrics(path: str | os.PathLike, metrics: Mapping[str, Any]) -> None:
 def is_metric(settings: Mapping[str, Any]) -> bool:
     """Test whether a prior with these settings predicts in metres."""
     said = flat(settings)  # including the settings that made a recording
+    if any(value == "m" for key, value in said.items() if key.split(".")[-1] == "unit"):
+        return True
     has_unit = not any(key.endswith("median_depth") for key in said)
     return has_unit and all(value != "arbitrary" for key, value in said.items() if key.endswith("scale"))
 

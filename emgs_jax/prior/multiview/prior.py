@@ -23,7 +23,7 @@ from emgs_jax.data.masks import check_names
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
-from emgs_jax.prior.multiview.dense import DenseConfig, Scene, Way
+from emgs_jax.prior.multiview.dense import DenseConfig, Depth, Scene, Way
 from emgs_jax.prior.multiview.depth import mean_difference
 from emgs_jax.prior.multiview.depth_files import DepthFilesConfig, way_of_files
 from emgs_jax.prior.multiview.depth_noise import relative_std
@@ -33,9 +33,10 @@ from emgs_jax.prior.multiview.matched import begin_matched
 from emgs_jax.prior.multiview.monocular_network import MeterConfig, way_of_meter
 from emgs_jax.prior.multiview.swept import SweptConfig, swept
 from emgs_jax.prior.sources import placed_beside, sources_of
+from emgs_jax.scale.sources import ScaleConfig, View, metres_of
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import names_at
-from emgs_jax.structure.model import NONE, Structure
+from emgs_jax.structure.model import NONE, Structure, scaled
 from emgs_jax.structure.sequence import structure_of
 
 jitted_difference = eqx.filter_jit(mean_difference)
@@ -68,13 +69,18 @@ def _values(config: StructureConfig | DenseConfig) -> dict:
 class MultiviewStereo(Prior):
     """Structure from motion of all images, and dense depth of each."""
 
-    def __init__(self, structure: StructureConfig, dense: AnyDense) -> None:
-        self._config, self._dense, self._way = structure, dense, way_of(dense)
+    def __init__(self, structure: StructureConfig, dense: AnyDense, metres: ScaleConfig = ScaleConfig()) -> None:  # noqa: B008 (it is frozen)
+        self._config, self._dense, self._way, self._metres = structure, dense, way_of(dense), metres
         settings = {"structure": _values(structure), "dense": _described(dense, self._way)}
+        if metres.is_given or getattr(dense, "kind", None) == "metric":
+            settings["unit"] = "m"
+        if metres.is_given:
+            settings["scale"] = jsonable(asdict(metres))
         self.provenance = Provenance("multiview_stereo", {"version": 14} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
         self._found: Structure | None = None
+        self._scale_std: float | None = None
 
     def num_newer(self, window_size: int) -> int:
         """All but one: a structure knows all images, so the first frame alone begins the map."""
@@ -96,11 +102,13 @@ class MultiviewStereo(Prior):
         self._prepare()
 
     def report(self) -> dict[str, float]:
-        """`prior/placed_percent`: frames with a pose in a model; `prior/num_worlds`: number of models."""
+        """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models, and, in
+        metres by `scale=`, `prior/scale_std_percent`."""
         if self._found is None:
             return {}
         placed = 100 * float(self._found.is_placed.mean())
-        return {"prior/placed_percent": placed, "prior/num_worlds": len(self._found.worlds)}
+        known = {} if self._scale_std is None else {"prior/scale_std_percent": 100 * self._scale_std}
+        return {"prior/placed_percent": placed, "prior/num_worlds": len(self._found.worlds)} | known
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict; a view that is in no model has NaN and no valid point."""
@@ -143,6 +151,31 @@ class MultiviewStereo(Prior):
         ]
         self._found, depths = self._way.begin(Scene(self._dataset, found, self._lenses, self._camera))
         self._depths = lru_cache(NUM_KEPT)(depths)  # a frame's neighbours ask for its depth again
+        if self._metres.is_given:
+            self._to_metres()
+
+    def _to_metres(self) -> None:
+        """Bring structure and depths into metres by the lengths that are known; other worlds keep their unit."""
+
+        def view(frame: int) -> View:
+            points, confidence, mask = self._answer(frame)
+            return View(points, 1.0 / confidence, mask)
+
+        found, depths = metres_of(self._metres, self._dataset, self._found, view), self._depths
+        factors = np.ones(len(found))
+        for world, (scale, _, notes) in enumerate(found):
+            of = f" of model {world}" if len(found) > 1 else ""
+            said = [] if scale is None else [f"± {100 * scale.std:.1f} %, by {scale.source}"]
+            tqdm.write(f"scale{of}: {'; '.join([*(said or ['unknown']), *notes])}")
+            factors[world] = 1.0 if scale is None else scale.factor
+        self._scale_std = next(scale.std for scale, *_ in found if scale is not None)
+        self._found = scaled(self._found, factors)
+
+        def in_metres(frame: int) -> Depth:
+            one = depths(frame)
+            return one._replace(depth=np.float32(factors[self._found.world[frame]]) * one.depth)
+
+        self._depths = lru_cache(NUM_KEPT)(in_metres)
 
     def _world_at(self, frame: int) -> int:
         """World of a frame, or of the last frame before it that has one."""

@@ -1,0 +1,210 @@
+"""`scale=`: the sources of a length in metres that a user gives, and what they say of a structure."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+
+from emgs_jax.data.base import Dataset
+from emgs_jax.data.euroc import read_sensor
+from emgs_jax.data.masks import files_of, image_names, stem
+from emgs_jax.ops.ranges import number
+from emgs_jax.scale.estimate import Scale, combined, scale_from
+from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_level, surfaces_of
+from emgs_jax.scale.inertial import read_inertial, scale_of_motion
+from emgs_jax.scale.positions import positions_of_exif, read_positions, scale_of_positions
+from emgs_jax.scale.tape import point_at, scale_of_distance
+from emgs_jax.scale.up import up_of_cameras, up_of_surfaces
+from emgs_jax.structure.model import Structure
+
+NUM_VIEWS = 24  # frames in which a floor is looked for, evenly spread
+PIXELS = 60  # of a frame's longer side, whose surfaces are used
+
+
+@dataclass(frozen=True)
+class ScaleConfig:
+    """Where a length in metres comes from; several are combined by their uncertainty, none leaves the unit unknown."""
+
+    # [image, x1, y1, x2, y2, metres], or several of these: two pixels of an image on disk and the metres between what
+    # they show
+    distance: Sequence[Any] | None = None
+    height: float | None = number(None, low=1e-3, high=1e4)  # metres of the camera above the floor, in the median
+    positions: str | None = None  # of the cameras: exif (GPS of photos), or a file, see `read_positions`
+    imu: str | None = None  # file of an inertial measurement unit, see `read_inertial`
+    # camera → unit: 16 numbers row by row, or a sensor.yaml of the camera as EuRoC has
+    T_imu_camera: Sequence[float] | str | None = None
+
+    def __post_init__(self) -> None:
+        for one in self.distances:
+            numbers = [value for value in one[1:] if isinstance(value, (int, float)) and np.isfinite(value)]
+            if len(one) != 6 or len(numbers) != 5 or not one[5] > 0:
+                raise ValueError(
+                    f"scale.distance={[*one]} must be [image, x1, y1, x2, y2, metres]: the name of an image, two of "
+                    "its pixels and the metres between what they show"
+                )
+        if self.imu is not None and self.T_imu_camera is None:
+            raise ValueError(
+                "scale.imu goes with scale.T_imu_camera: 16 numbers, camera → unit in metres, or the camera's "
+                "sensor.yaml with T_BS"
+            )
+
+    @property
+    def distances(self) -> list[Sequence[Any]]:
+        """Each distance by itself."""
+        if self.distance is None:
+            return []
+        is_several = all(isinstance(one, Sequence) and not isinstance(one, str) for one in self.distance)
+        return [*self.distance] if is_several else [self.distance]
+
+    @property
+    def is_given(self) -> bool:
+        """Whether there is any source."""
+        return any(value is not None for value in (self.distance, self.height, self.positions, self.imu))
+
+
+class View(NamedTuple):
+    """What a frame shows."""
+
+    points: Float[np.ndarray, "h w 3"]  # in the camera's axes, the structure's unit
+    std: Float[np.ndarray, "h w"]  # of the logarithm of each depth
+    mask: Bool[np.ndarray, "h w"]  # where points are known
+
+
+class Metres(NamedTuple):
+    """What the sources say of a world."""
+
+    scale: Scale | None  # None: nothing
+    up: Float[np.ndarray, "3"]  # unit vector in the world
+    notes: tuple[str, ...]
+
+
+def metres_of(
+    config: ScaleConfig, dataset: Dataset, structure: Structure, view: Callable[[int], View]
+) -> list[Metres]:
+    """Find scale and up of each world of a structure, by all sources that are given.
+
+    Raises:
+        ValueError: a source cannot be read, or says nothing of any world.
+    """
+    names = image_names(*files_of(dataset))
+    found = [_of_world(config, dataset, structure, world, names, view) for world in range(len(structure.worlds))]
+    if all(one.scale is None for one in found):
+        raise ValueError("scale: " + "; ".join(note for one in found for note in one.notes))
+    return found
+
+
+def _of_world(
+    config: ScaleConfig,
+    dataset: Dataset,
+    structure: Structure,
+    world: int,
+    names: Sequence[str],
+    view: Callable[[int], View],
+) -> Metres:
+    frames = np.flatnonzero(structure.world == world)
+    poses, focal = structure.T_world_camera[frames], dataset.intrinsics[0]
+    up, scales, notes = up_of_cameras(poses[:, :3, :3]), [], []
+    for image, *pixels, metres in config.distances:
+        frame = _frame_of(str(image), names)
+        if frame not in frames:
+            notes.append(f"image {image} of scale.distance has no pose in this model")
+            continue
+        ends = [point_at(*_known(view(frame)), dataset.pixel_of(frame, np.array(pixels[k : k + 2]))) for k in (0, 2)]
+        if None in ends:
+            raise ValueError(
+                f"scale.distance: no depth is known at {pixels[:2] if ends[0] is None else pixels[2:]} of image {image}: "
+                "choose points with texture, or another image"
+            )
+        points, stds = (np.stack(part) for part in zip(*ends, strict=True))
+        scales.append(scale_of_distance(points, stds, focal, float(metres), f"distance in {image}"))
+    if config.height is not None:
+        up, scale = _by_floor(config.height, frames, poses, view, focal, up)
+        scales += [] if scale is None else [scale]
+        notes += ["no floor was found below the cameras"] if scale is None else []
+    if config.positions is not None:
+        positions = _positions(config.positions, dataset, names)[frames]
+        try:
+            placed = scale_of_positions(poses[:, :3, 3], positions, "positions")
+        except ValueError as error:
+            notes.append(str(error))
+        else:
+            scales.append(placed.scale)
+            up = placed.T_metres_world.rotation.T @ np.array([0.0, 0.0, 1.0])
+            notes.append(f"{placed.num_used} positions fit within {placed.residual:.2g} m")
+    if config.imu is not None:
+        times = np.array([dataset[int(frame)].timestamp for frame in frames])
+        try:
+            motion = scale_of_motion(times, poses, read_inertial(Path(config.imu)), _mounted(config), "imu")
+        except ValueError as error:
+            notes.append(str(error))
+        else:
+            scales.append(motion.scale)
+            up = motion.up
+            notes.append(f"gravity by the imu (± {motion.up_std_deg:.1f}°)")
+    if not scales:
+        return Metres(None, up, tuple(notes))
+    scale, warning = combined(scales)
+    return Metres(scale, up, tuple(filter(None, [warning, *notes])))
+
+
+def _known(view: View) -> tuple[np.ndarray, np.ndarray]:
+    return np.where(view.mask[..., None], view.points, 0.0), view.std
+
+
+def _frame_of(image: str, names: Sequence[str]) -> int:
+    """The frame of an image's name, with or without suffix, or of its number in a video."""
+    for name in (image, stem(image), image.zfill(6)):
+        if name in names:
+            return list(names).index(name)
+    raise ValueError(
+        f"scale.distance: image {image} is not in use: there are {names[0]} to {names[-1]} (dataset.start, stop and "
+        "stride choose)"
+    )
+
+
+def _by_floor(
+    height: float,
+    frames: np.ndarray,
+    poses: Float[np.ndarray, "n 4 4"],
+    view: Callable[[int], View],
+    focal: float,
+    up: Float[np.ndarray, "3"],
+) -> tuple[Float[np.ndarray, "3"], Scale | None]:
+    """Find up by floors and walls, and the scale by the median height of the cameras above the floor."""
+    rows = np.unique(np.linspace(0, len(frames) - 1, min(NUM_VIEWS, len(frames))).round().astype(int))
+    each = []
+    for row in rows:
+        points, _ = _known(view(int(frames[row])))
+        step = max(round(max(points.shape[:2]) / PIXELS), 1)
+        each.append(surfaces_of(points, poses[row], step))
+    surfaces = Surfaces(*(np.concatenate(part) for part in zip(*each, strict=True)))
+    up = up_of_surfaces(up, surfaces.normals, surfaces.areas)
+    level = floor_level(surfaces, up, poses[:, :3, 3])
+    if level is None:
+        return up, None
+    heights = poses[:, :3, 3] @ up - level
+    middle = float(np.median(heights))
+    spread = 1.4826 * float(np.median(np.abs(heights - middle))) / middle
+    return up, scale_from("height", height, middle, np.hypot(spread / len(heights) ** 0.5, MIN_STD))
+
+
+def _positions(given: str, dataset: Dataset, names: Sequence[str]) -> Float[np.ndarray, "n 3"]:
+    if given == "exif":
+        return positions_of_exif(files_of(dataset)[0])
+    return read_positions(
+        Path(given).expanduser(), names, [dataset[index].timestamp for index in range(len(dataset))]
+    )
+
+
+def _mounted(config: ScaleConfig) -> Float[np.ndarray, "4 4"]:
+    """T_imu_camera as a matrix."""
+    given = config.T_imu_camera
+    if isinstance(given, str):
+        return read_sensor(Path(given).expanduser())[1]
+    T = np.asarray(given, np.float64)
+    if T.size != 16 or not np.allclose(T.reshape(4, 4)[:3, :3] @ T.reshape(4, 4)[:3, :3].T, np.eye(3), atol=1e-3):
+        raise ValueError(f"scale.T_imu_camera must be the 16 numbers of a rigid motion, row by row, got {given}")
+    return T.reshape(4, 4)

@@ -1,0 +1,58 @@
+"""A length that was measured between two pixels of an image."""
+
+import numpy as np
+from jaxtyping import Float
+
+from emgs_jax.scale.estimate import Scale, scale_from
+
+CLICK_STD = 1.0  # of each pixel, in those of the frame
+REACH = 2  # pixels beside the one that is given
+
+
+def scale_of_distance(
+    points: Float[np.ndarray, "2 3"], depth_std: Float[np.ndarray, "2"], focal: float, metres: float, source: str
+) -> Scale:
+    """Compare the distance of two points of a frame with its metres.
+
+    The points err along their rays, by a share of their depth, and beside them by a pixel. With u the direction from
+    one to the other and L their distance, σ² = Σ (u·p σ_z)² / L² for independent depths, at least that of an error that
+    both share, which is σ_z itself.
+
+    Args:
+        points: in the camera's axes, any unit.
+        depth_std: of the logarithm of each depth.
+        focal: in pixels of the frame.
+    """
+    apart = points[1] - points[0]
+    units = float(np.linalg.norm(apart))
+    along = points @ (apart / units) * depth_std
+    beside = CLICK_STD * points[:, 2] / focal
+    variance = max(float(along @ along) / units**2, float(np.mean(depth_std)) ** 2) + float(beside @ beside) / units**2
+    return scale_from(source, metres, units, variance**0.5)
+
+
+def point_at(
+    points: Float[np.ndarray, "h w 3"], std: Float[np.ndarray, "h w"], pixel: Float[np.ndarray, "2"]
+) -> tuple[Float[np.ndarray, "3"], float] | None:
+    """Return the point of a frame at a pixel, and the standard deviation of the logarithm of its depth.
+
+    The depth is the median within `REACH` pixels. If it varies there, as at an edge, its spread counts.
+
+    Args:
+        points: in the camera's axes, 0 where there is none.
+        pixel: column and row.
+
+    Returns:
+        None where no depth is known near the pixel.
+    """
+    column, row = np.rint(pixel).astype(int)
+    near = slice(max(row - REACH, 0), row + REACH + 1), slice(max(column - REACH, 0), column + REACH + 1)
+    some, stds = points[near].reshape(-1, 3), std[near].reshape(-1)
+    stds, some = stds[some[:, 2] > 0], some[some[:, 2] > 0].astype(np.float64)
+    if not len(some):
+        return None
+    logs = np.log(some[:, 2])
+    middle = float(np.median(logs))
+    spread = 1.4826 * float(np.median(np.abs(logs - middle)))
+    nearest = some[np.argmin(np.abs(logs - middle))]
+    return nearest, float(np.hypot(np.median(stds), spread))

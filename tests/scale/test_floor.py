@@ -1,0 +1,104 @@
+"""Up and the floor, in a drawn room: floor, walls and a table, seen by a camera that looks down."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.scale.floor import Surfaces, floor_level, surfaces_of
+from emgs_jax.scale.up import up_of_cameras, up_of_surfaces
+
+
+def angle(a, b) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
+
+
+def cameras(yaws, pitch, roll=0.0):
+    """Rotations of cameras in a world with z up; OpenCV axes."""
+    level = Rotation.from_matrix([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # looks along y
+    return np.stack(
+        [
+            (Rotation.from_euler("z", yaw, degrees=True) * level * Rotation.from_euler("xz", [-pitch, roll], degrees=True))
+            .as_matrix()
+            for yaw in yaws
+        ]
+    )
+
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+def test_cameras_that_look_down_and_turn_still_tell_up():
+    rotations = cameras(np.linspace(0, 120, 20), pitch=50)
+    mean_y = -rotations[:, :, 1].mean(axis=0)
+    assert angle(mean_y / np.linalg.norm(mean_y), UP) > 30  # what was taken before
+    assert angle(up_of_cameras(rotations), UP) < 3
+
+
+def test_a_camera_that_does_not_turn_has_its_own_y():
+    rotations = cameras([10.0] * 5, pitch=20)
+    assert angle(up_of_cameras(rotations), -rotations[0, :, 1]) < 1e-3
+
+
+def room(rng, count=4000):
+    """Patches of a room of 4 x 4 x 2.5 m with a table of .8 m, and wrong ones below the floor."""
+    floor = np.column_stack([rng.uniform(-2, 2, (count, 2)), np.zeros(count)])
+    table = np.column_stack([rng.uniform(-0.6, 0.6, (count, 2)), np.full(count, 0.8)])
+    wall = np.column_stack([np.full(count, 2.0), rng.uniform(-2, 2, count), rng.uniform(0, 2.5, count)])
+    wrong = np.column_stack([rng.uniform(-2, 2, (40, 2)), rng.uniform(-2, -0.2, 40)])
+    points = np.concatenate([floor, table, wall, wrong])
+    up, across = np.tile(UP, (count, 1)), np.tile([-1.0, 0, 0], (count, 1))
+    normals = np.concatenate([up, up, across, np.tile(UP, (40, 1))])
+    normals = Rotation.from_rotvec(0.03 * rng.normal(size=normals.shape)).apply(normals)
+    areas = np.concatenate([np.full(count, 0.3), np.ones(count), np.ones(count), np.ones(40)])
+    return Surfaces(points, normals, areas)
+
+
+def test_floors_and_walls_improve_up():
+    surfaces = room(np.random.default_rng(0))
+    tilted = Rotation.from_euler("xy", [11, -9], degrees=True).apply(UP)
+    assert angle(up_of_surfaces(tilted, surfaces.normals, surfaces.areas), UP) < 0.5
+
+
+def test_walls_alone_improve_up_in_their_direction():
+    normals = np.tile([1.0, 0.0, 0.0], (50, 1))
+    tilted = Rotation.from_euler("y", 8, degrees=True).apply(UP)
+    assert angle(up_of_surfaces(tilted, normals, np.ones(50)), UP) < 0.5
+
+
+def test_without_surfaces_up_stays():
+    up = Rotation.from_euler("x", 5, degrees=True).apply(UP)
+    assert up_of_surfaces(up, np.zeros((0, 3)), np.zeros(0)) == pytest.approx(up)
+
+
+def test_the_floor_is_the_lowest_large_level():
+    """Below the table's, which is seen more, and above what is wrong; a wall is no level."""
+    level = floor_level(room(np.random.default_rng(1)), UP, np.array([[0.0, 0.0, 1.5], [0.5, 0.0, 1.6]]))
+    assert level == pytest.approx(0.0, abs=0.01)
+
+
+def test_nothing_below_the_cameras_is_no_floor():
+    surfaces = room(np.random.default_rng(2))
+    assert floor_level(surfaces, UP, np.array([[0.0, 0.0, -3.0]])) is None
+
+
+def test_surfaces_of_a_view_face_the_camera_and_have_its_pose():
+    """A camera 1.4 m above a floor that looks straight down."""
+    v, u = np.mgrid[0:24, 0:32]
+    points = 1.4 * np.stack([(u - 15.5) / 30, (v - 11.5) / 30, np.ones(u.shape)], axis=-1)
+    points[:4] = 0  # not known
+    T = np.eye(4)
+    T[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    T[:3, 3] = [3.0, 0.0, 1.4]
+    surfaces = surfaces_of(points, T, step=2)
+    assert surfaces.points[:, 2] == pytest.approx(0.0, abs=1e-9)
+    assert surfaces.normals == pytest.approx(np.tile(UP, (len(surfaces.points), 1)))
+    assert surfaces.areas == pytest.approx((2 * 1.4 / 30) ** 2)
+    assert len(surfaces.points) == (12 - 2 - 1) * 15
+
+
+def test_a_step_in_depth_is_no_surface():
+    v, u = np.mgrid[0:24, 0:32]
+    depth = np.where(u < 16, 1.0, 2.0)
+    points = depth[..., None] * np.stack([(u - 15.5) / 30, (v - 11.5) / 30, np.ones(u.shape)], axis=-1)
+    surfaces = surfaces_of(points, np.eye(4), step=1)
+    assert np.abs(surfaces.normals[:, 2]) == pytest.approx(1.0)

@@ -1,0 +1,108 @@
+"""Scale and gravity from a simulated inertial measurement unit, whose biases and errors are known."""
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.scale.inertial import GRAVITY, Inertial, read_inertial, scale_of_motion
+
+RATE, SECONDS, FPS = 200, 16.0, 10
+T_IMU_CAMERA = np.eye(4)
+T_IMU_CAMERA[:3, :3] = Rotation.from_euler("xyz", [88, 3, -91], degrees=True).as_matrix()
+T_IMU_CAMERA[:3, 3] = [0.05, -0.03, 0.1]
+BIASES = np.array([0.002, -0.02, 0.07]), np.array([-0.02, 0.3, 0.07])
+
+
+def walk(seed=0, noise=0.0, unit=0.37, errors=True):
+    """A hand-held walk: times, camera poses in another unit and world, and what the unit measures."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(0, SECONDS, 1 / RATE)
+    waves, phases = rng.uniform(0.2, 0.9, (6, 3)), rng.uniform(0, 6.28, (6, 3))
+    size = np.array([0.5, 0.5, 0.15])
+    arg = 2 * np.pi * waves[:3] * t[:, None, None] + phases[:3]
+    position = (size * np.sin(arg)).sum(axis=1)
+    acceleration = (-size * (2 * np.pi * waves[:3]) ** 2 * np.sin(arg)).sum(axis=1)
+    angles = (0.25 * np.sin(2 * np.pi * waves[3:] * t[:, None, None] + phases[3:])).sum(axis=1)
+    rotation = Rotation.from_euler("xyz", angles)
+    rates = np.vstack([(rotation[:-1].inv() * rotation[1:]).as_rotvec() * RATE, np.zeros(3)])
+    force = rotation.inv().apply(acceleration + [0, 0, GRAVITY])
+    if errors:
+        rates = rates + BIASES[0] + 2e-3 * rng.normal(size=rates.shape)
+        force = force + BIASES[1] + 3e-2 * rng.normal(size=force.shape)
+    rows = np.arange(RATE // FPS, len(t) - RATE // FPS, RATE // FPS)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = (rotation[rows] * Rotation.from_matrix(T_IMU_CAMERA[:3, :3])).as_matrix()
+    poses[:, :3, 3] = position[rows] + rotation[rows].apply(T_IMU_CAMERA[:3, 3]) + noise * rng.normal(size=(len(rows), 3))
+    turn = Rotation.random(random_state=seed).as_matrix()
+    world = np.eye(4)
+    world[:3, :3] = turn
+    poses = world @ poses
+    poses[:, :3, 3] = unit * poses[:, :3, 3] + [4.0, 5.0, 6.0]
+    half = 0.5 / RATE  # rates are between two times
+    return t[rows], poses, Inertial(t, rates, force), turn[:, 2], half
+
+
+def angle(a, b) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
+
+
+def test_scale_gravity_and_biases_are_found():
+    times, poses, measured, up, _ = walk()
+    motion = scale_of_motion(times, poses, measured, T_IMU_CAMERA, "imu")
+    assert motion.scale.factor == pytest.approx(1 / 0.37, rel=0.01)
+    assert angle(motion.up, up) < 0.5
+    assert motion.gyroscope_bias == pytest.approx(BIASES[0], abs=2e-3)
+    assert motion.accelerometer_bias == pytest.approx(BIASES[1], abs=0.08)
+
+
+def test_the_arm_from_the_camera_counts():
+    times, poses, measured, *_ = walk(errors=False)
+    without = T_IMU_CAMERA.copy()
+    without[:3, 3] += 0.5
+    right = scale_of_motion(times, poses, measured, T_IMU_CAMERA, "imu").scale
+    wrong = scale_of_motion(times, poses, measured, without, "imu").scale
+    assert abs(right.log + np.log(0.37)) < 0.005 < abs(wrong.log + np.log(0.37))
+
+
+@pytest.mark.slow
+def test_the_scale_of_motions_is_calibrated():
+    off, tilt = [], []
+    for seed in range(12):
+        times, poses, measured, up, _ = walk(seed, noise=0.01)
+        motion = scale_of_motion(times, poses, measured, T_IMU_CAMERA, "imu")
+        off.append((motion.scale.log + np.log(0.37)) / motion.scale.std)
+        tilt.append(angle(motion.up, up))
+    assert np.sqrt(np.mean(np.square(off))) < 1.5 and max(np.abs(off)) < 3
+    assert np.median(tilt) < 1
+
+
+def test_frames_without_measurements_are_an_error():
+    times, poses, measured, *_ = walk()
+    with pytest.raises(ValueError, match="by the clock of the images"):
+        scale_of_motion(times + 1e6, poses, measured, T_IMU_CAMERA, "imu")
+    with pytest.raises(ValueError, match="too few"):
+        scale_of_motion(times[:15], poses[:15], measured, T_IMU_CAMERA, "imu")
+
+
+def test_a_table_of_euroc_is_read(tmp_path):
+    path = tmp_path / "data.csv"
+    rows = [f"{1403715273262142976 + 5000000 * row},0.1,0.2,0.3,9.1,0.1,-3.7" for row in range(12)]
+    path.write_text("#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z\n" + "\n".join(rows))
+    measured = read_inertial(path)
+    assert np.diff(measured.times) == pytest.approx(0.005, abs=1e-6)
+    assert measured.rates[3] == pytest.approx([0.1, 0.2, 0.3]) and measured.accelerations[3, 2] == -3.7
+
+
+@pytest.mark.parametrize(
+    ("row", "message"),
+    [
+        ("{t} 0 0 0 0 0 1", "1 g = 9.81"),
+        ("{t} 0 0 0 0 0", "expected time, three rates"),
+        ("1 0 0 0 0 0 9.8", "ascending times"),
+    ],
+)
+def test_tables_of_something_else_are_named(tmp_path, row, message):
+    path = tmp_path / "imu.txt"
+    path.write_text("time wx wy wz ax ay az\n" + "\n".join(row.format(t=0.01 * index) for index in range(20)))
+    with pytest.raises(ValueError, match=message):
+        read_inertial(path)

@@ -1,0 +1,57 @@
+"""A length between two pixels."""
+
+import numpy as np
+import pytest
+
+from emgs_jax.scale.tape import point_at, scale_of_distance
+
+FOCAL = 300.0
+
+
+def test_a_distance_across_the_view_gives_its_scale():
+    points = np.array([[-0.5, 0.0, 2.0], [0.5, 0.0, 2.0]])
+    scale = scale_of_distance(points, np.array([0.01, 0.01]), FOCAL, 2.5, "distance")
+    assert scale.factor == pytest.approx(2.5)
+    beside = (2 * (2.0 / FOCAL) ** 2) ** 0.5
+    assert scale.std == pytest.approx((0.01**2 + beside**2) ** 0.5)  # an error that both share
+
+
+def test_a_distance_along_the_view_errs_by_both_depths():
+    points = np.array([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]])
+    scale = scale_of_distance(points, np.array([0.01, 0.02]), 1e9, 1.0, "distance")
+    assert scale.std == pytest.approx((0.02**2 + 0.06**2) ** 0.5)
+
+
+def test_its_standard_deviation_is_right():
+    """Points that err along their rays by what they say, beside a pixel."""
+    rng, truth = np.random.default_rng(0), np.array([[-0.8, 0.3, 2.0], [0.6, -0.2, 3.5]])
+    metres, off = np.linalg.norm(truth[1] - truth[0]), []
+    for _ in range(2000):
+        points = truth * np.exp(0.03 * rng.normal(size=(2, 1)))
+        points[:, :2] += points[:, 2:] / FOCAL * rng.normal(size=(2, 2))
+        scale = scale_of_distance(points, np.array([0.03, 0.03]), FOCAL, metres, "distance")
+        off.append(scale.log / scale.std)
+    assert 0.7 < np.std(off) < 1.1
+
+
+def test_the_point_at_a_pixel_is_the_median_near_it():
+    depth = np.full((20, 30), 2.0)
+    depth[10, 15] = 9.0  # a wrong one
+    points = np.stack([0 * depth, 0 * depth, depth], axis=-1)
+    point, std = point_at(points, np.full((20, 30), 0.01), np.array([15.0, 10.0]))
+    assert point[2] == pytest.approx(2.0) and std == pytest.approx(0.01)
+
+
+def test_an_edge_is_less_sure():
+    depth = np.full((20, 30), 2.0)
+    depth[:, 16:] = 4.0
+    points = np.stack([0 * depth, 0 * depth, depth], axis=-1)
+    near = point_at(points, np.full((20, 30), 0.01), np.array([15.0, 10.0]))
+    far = point_at(points, np.full((20, 30), 0.01), np.array([10.0, 10.0]))
+    depth[9:12, 14:18] = np.linspace(2, 4, 12).reshape(3, 4)
+    mixed = point_at(np.stack([0 * depth, 0 * depth, depth], axis=-1), np.full((20, 30), 0.01), np.array([16.0, 10.0]))
+    assert far[1] == pytest.approx(0.01) and near[0][2] == 2.0 and mixed[1] > 0.05
+
+
+def test_no_depth_near_a_pixel_is_no_point():
+    assert point_at(np.zeros((20, 30, 3)), np.ones((20, 30)), np.array([3.0, 3.0])) is None
