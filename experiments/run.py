@@ -40,6 +40,7 @@ from emgs_jax.runs.metrics import (
     compared_text,
     describe,
     new_scorer,
+    scale_off,
     score_back_end,
     score_baselines,
     score_map,
@@ -132,6 +133,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
                 metrics |= of_prior.result() | score_baselines(session, baselines, raw, scorer)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
         metrics |= dataset.report()
+        metrics |= scale_off(metrics)
     metrics["provenance"] = origin
     write_metrics(folder / "metrics.json", metrics)
     keeper.drop()

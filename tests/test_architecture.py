@@ -31,6 +31,7 @@ HOST = (
         "keypoints",
         "loop_closure",
         "structure",
+        "scale",
         "prior",
         "evaluation",
         "device",

@@ -14,7 +14,9 @@ from matplotlib.patheffects import withStroke
 from emgs_jax.drawing.colors import OURS, PATHS, class_colors, save_figure
 from emgs_jax.evaluation.clouds import PointCloud
 from emgs_jax.geometry import rotated
+from emgs_jax.scale.up import up_of_cameras, up_of_surfaces
 
+MAX_NORMALS = 20_000  # of which up is found
 _INK, _PAPER = "#333333", "#e3e6ea"
 
 
@@ -53,7 +55,7 @@ def draw_overview(
     axes = left.subplots(1 if features is None else 2, squeeze=False)[:, 0]
     _draw_map(axes[0], cloud, paths)
     if features is not None:
-        rotation = view_from_above(paths.estimate)
+        rotation = view_from_above(paths.estimate, cloud.normals)
         _paint(axes[1], features, rotation, paths.estimate[:, :3, 3] @ rotation[2], (40, 250))
         _bare(axes[1])
         axes[1].set_title("features of the map, their main directions as colours", fontsize=11, color=_INK)
@@ -65,10 +67,18 @@ def draw_overview(
     save_figure(path, figure)
 
 
-def view_from_above(poses: np.ndarray) -> np.ndarray:
-    """Return world → picture (3, 3) with rows right, forward, up; up is the cameras' mean -y (OpenCV axes)."""
-    up = -poses[:, :3, 1].mean(0)
-    up = up / np.linalg.norm(up) if np.linalg.norm(up) > 1e-6 else -poses[0, :3, 1]
+def view_from_above(poses: np.ndarray, normals: np.ndarray | None = None) -> np.ndarray:
+    """Return world → picture (3, 3) with rows right, forward, up.
+
+    Args:
+        poses: of cameras that are held level, but may look down: see `up_of_cameras`.
+        normals: of the map, (n, 3) of any length, 0 where unknown; floors and walls improve up (`up_of_surfaces`).
+    """
+    up = up_of_cameras(poses[:, :3, :3])
+    if normals is not None:
+        some = normals[:: len(normals) // MAX_NORMALS + 1].astype(np.float64)
+        lengths = np.linalg.norm(some, axis=1)
+        up = up_of_surfaces(up, some / np.maximum(lengths, 1e-9)[:, None], np.float64(lengths > 0))
     centers = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
     flat = centers - np.outer(centers @ up, up)
     # The path's longest direction points right; a camera at rest looks up the picture.
@@ -132,7 +142,7 @@ def seen_from_above(
 
 
 def _draw_map(axes: Axes, cloud: PointCloud, paths: Paths) -> None:
-    rotation = view_from_above(paths.estimate)
+    rotation = view_from_above(paths.estimate, cloud.normals)
     path = paths.estimate[:, :3, 3] @ rotation.T
     count = _paint(axes, cloud, rotation, path[:, 2])
     for name, poses, label, width in (

@@ -80,7 +80,7 @@ def _about(run: FinishedRun, layers: dict[str, np.ndarray]) -> dict[str, Any]:
     poses = run.poses[run.is_placed] if run.is_placed.any() else run.poses[:1]
     means = layers["mean"].astype(np.float64) if len(layers["mean"]) else poses[:, :3, 3]
     low, high = np.percentile(np.concatenate([means, poses[:, :3, 3]]), [1, 99], axis=0)
-    rotation = view_from_above(poses)
+    rotation = view_from_above(poses, layers["normal"])
     camera, names = run.camera, () if run.text is None else run.text.names
     (fx, fy), (cx, cy) = map(float, camera.focal), map(float, camera.center)
     return {

@@ -1,5 +1,6 @@
 """metrics.json of a run: map and raw prior against the truth, counts and times."""
 
+import math
 from collections import Counter
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -246,6 +247,15 @@ def _loops(run: MappingRun) -> tuple[list[tuple[int, int, np.ndarray]], list[np.
     ]
     of_saved: list[np.ndarray | None] = [None] * end.first_node
     return loops, of_saved + run.true_poses[row_of_first_node(run) :]
+
+
+def scale_off(metrics: Metrics) -> Metrics:
+    """Return by how many standard deviations of its own the scale is off, if it has one and the truth is known.
+
+    `trajectory/scale` is the factor to the truth: 1 for a map in right metres.
+    """
+    std, factor = metrics.get("prior/scale_std_percent"), metrics.get("trajectory/scale")
+    return {} if not std or not factor else {"trajectory/scale_off_std": abs(math.log(factor)) / (0.01 * std)}
 
 
 def spent(clock: Clock) -> Metrics:

@@ -19,9 +19,7 @@ class Surfaces(NamedTuple):
     areas: Float[np.ndarray, "n"]
 
 
-def surfaces_of(
-    points: Float[np.ndarray, "h w 3"], T_world_camera: Float[np.ndarray, "4 4"], step: int
-) -> Surfaces:
+def surfaces_of(points: Float[np.ndarray, "h w 3"], T_world_camera: Float[np.ndarray, "4 4"], step: int) -> Surfaces:
     """Return the patches of a frame, every `step` pixels.
 
     A normal is the cross product of the differences to the pixels `step` to the right and below, where neither is more
@@ -43,9 +41,7 @@ def surfaces_of(
     return Surfaces(here @ rotation.T + center, normals @ rotation.T, areas)
 
 
-def floor_level(
-    surfaces: Surfaces, up: Float[np.ndarray, "3"], centers: Float[np.ndarray, "c 3"]
-) -> float | None:
+def floor_level(surfaces: Surfaces, up: Float[np.ndarray, "3"], centers: Float[np.ndarray, "c 3"]) -> float | None:
     """Return the height of the floor along `up`: the lowest large level below the cameras; None without one.
 
     A level is a bin of heights; its area is that of patches that lie flat. Points below the floor, mirrored or wrong,

@@ -82,7 +82,8 @@ def read_inertial(path: Path) -> Inertial:
             continue
         if values is None or len(values) < 7 or not np.isfinite(values).all():
             raise ValueError(
-                f"{path}, line {number}: expected time, three rates (rad/s) and three accelerations (m/s²), got {line!r}"
+                f"{path}, line {number}: expected a time, three rates (rad/s) and three accelerations (m/s²), got "
+                f"{line!r}"
             )
         rows.append(values)
     table = np.array(rows, np.float64).reshape(-1, 7)
@@ -214,7 +215,7 @@ def _window(
     return Window(tau, np.concatenate([gained, 0.5 * tau[:, None, None] ** 2 * np.eye(3)], axis=-1), positions)
 
 
-def _whitened(window: Window, noise: float, q: float) -> tuple[Float[np.ndarray, "j 10"], Float[np.ndarray, "j"]]:
+def _whitened(window: Window, noise: float, q: float) -> tuple[Float[np.ndarray, "j 10"], Float[np.ndarray, " j"]]:
     """M and x with errors of unit variance, without what the window's own c and v explain.
 
     Args:
@@ -237,7 +238,7 @@ class Equations(NamedTuple):
     """All windows' equations in a triangle: x = R θ with unit variance, and the root mean square of what is left."""
 
     triangle: Float[np.ndarray, "u u"]
-    target: Float[np.ndarray, "u"]
+    target: Float[np.ndarray, " u"]
     left: float
 
 

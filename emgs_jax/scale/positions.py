@@ -44,8 +44,8 @@ def positions_of_exif(files: Sequence[Path | None]) -> Float[np.ndarray, "n 3"]:
     count = int(np.isfinite(found).all(axis=1).sum())
     if count < MIN_POSITIONS:
         raise ValueError(
-            f"scale.positions=exif: {count} of {len(files)} images have a GPS position with altitude in their EXIF, and "
-            f"{MIN_POSITIONS} are needed: videos and edited photos have none; give a file of positions"
+            f"scale.positions=exif: {count} of {len(files)} images have a GPS position with altitude in their EXIF, "
+            f"and {MIN_POSITIONS} are needed: videos and edited photos have none; give a file of positions"
         )
     return _in_metres(found)
 
@@ -80,9 +80,7 @@ def _in_metres(geographic: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]
     return found
 
 
-def read_positions(
-    path: Path, names: Sequence[str], times: Sequence[float]
-) -> Float[np.ndarray, "n 3"]:
+def read_positions(path: Path, names: Sequence[str], times: Sequence[float]) -> Float[np.ndarray, "n 3"]:
     """Read a position for each frame, metres; NaN where there is none.
 
     A line has the name of an image, or a time in seconds, and x y z in metres; further words are not read, so a
@@ -135,9 +133,7 @@ def read_positions(
     return _in_metres(found) if is_geographic else found
 
 
-def scale_of_positions(
-    centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], source: str
-) -> Placed:
+def scale_of_positions(centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], source: str) -> Placed:
     """Bring a path to positions by a similarity (Umeyama 1991), of those within `MAX_OFF` standard deviations of it.
 
     With residuals of variance r² in each coordinate, σ² of the log of the scale is r² / Σ |y_k - ȳ|², where y are the

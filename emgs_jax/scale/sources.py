@@ -81,9 +81,7 @@ class Metres(NamedTuple):
     notes: tuple[str, ...]
 
 
-def metres_of(
-    config: ScaleConfig, dataset: Dataset, structure: Structure, view: Callable[[int], View]
-) -> list[Metres]:
+def metres_of(config: ScaleConfig, dataset: Dataset, structure: Structure, view: Callable[[int], View]) -> list[Metres]:
     """Find scale and up of each world of a structure, by all sources that are given.
 
     Raises:
@@ -114,9 +112,10 @@ def _of_world(
             continue
         ends = [point_at(*_known(view(frame)), dataset.pixel_of(frame, np.array(pixels[k : k + 2]))) for k in (0, 2)]
         if None in ends:
+            unknown = pixels[:2] if ends[0] is None else pixels[2:]
             raise ValueError(
-                f"scale.distance: no depth is known at {pixels[:2] if ends[0] is None else pixels[2:]} of image {image}: "
-                "choose points with texture, or another image"
+                f"scale.distance: no depth is known at {unknown} of image {image}: choose points with texture, or "
+                "another image"
             )
         points, stds = (np.stack(part) for part in zip(*ends, strict=True))
         scales.append(scale_of_distance(points, stds, focal, float(metres), f"distance in {image}"))
@@ -194,9 +193,7 @@ def _by_floor(
 def _positions(given: str, dataset: Dataset, names: Sequence[str]) -> Float[np.ndarray, "n 3"]:
     if given == "exif":
         return positions_of_exif(files_of(dataset)[0])
-    return read_positions(
-        Path(given).expanduser(), names, [dataset[index].timestamp for index in range(len(dataset))]
-    )
+    return read_positions(Path(given).expanduser(), names, [dataset[index].timestamp for index in range(len(dataset))])
 
 
 def _mounted(config: ScaleConfig) -> Float[np.ndarray, "4 4"]:

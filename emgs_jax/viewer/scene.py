@@ -86,7 +86,7 @@ class Scene:
         if self.chosen is None:
             placed = run.poses[run.is_placed] if run.is_placed.any() else run.poses[:1]
             self.chosen = self._frustum(run, "/frame", 0, "#ffffff", 0.1)
-            self._scene.set_up_direction(view_from_above(placed)[2])
+            self._scene.set_up_direction(view_from_above(placed, run.layers.get("normal"))[2])
             self._place_views(placed[0])
 
     def recolor(self, colors: np.ndarray, of_splats: np.ndarray | None) -> None:

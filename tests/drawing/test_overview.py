@@ -43,6 +43,15 @@ def test_from_above_up_is_up_and_the_path_runs_to_the_right_and_the_view_turns_w
     np.testing.assert_allclose(view_from_above(turned) @ turn, view_from_above(poses), atol=1e-9)
 
 
+def test_floors_and_walls_make_the_picture_upright():
+    """Cameras that lean to one side; normals of any length, as the page keeps them."""
+    poses, lean = path_along([0.5, -3.0, 0.2]), Rotation.from_euler("x", 12, degrees=True).as_matrix()
+    poses[:, :3, :3] = lean @ poses[:, :3, :3]
+    normals = np.concatenate([np.tile([0, 0, 127], (50, 1)), np.tile([0, -127, 0], (50, 1)), np.zeros((9, 3))])
+    assert np.degrees(np.arccos(view_from_above(poses)[2, 2])) == pytest.approx(12, abs=0.1)
+    np.testing.assert_allclose(view_from_above(poses, normals.astype(np.int8))[2], [0, 0, 1], atol=0.01)
+
+
 @pytest.mark.parametrize("poses", [path_along([0.0, 0.0, 0.0]), path_along([0, 0, 0], 1), path_along([0, 0, 5.0])])
 def test_cameras_that_do_not_move_sideways_still_give_a_rotation(poses):
     rotation = view_from_above(poses)

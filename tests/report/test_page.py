@@ -173,6 +173,7 @@ def test_the_page_holds_the_splats_of_a_polished_run_and_of_too_many_those_that_
     [
         ({"level": 1.0}, True),
         ({"structure": {"median_depth": 2.0}}, False),  # multiview_stereo, and a recording of it
+        ({"structure": {"median_depth": 2.0}, "unit": "m"}, True),  # by scale=, or a network in metres
         ({"scale": "arbitrary", "anchor_depth_m": 2.0}, False),
         ({"scale": "metric"}, True),
     ],

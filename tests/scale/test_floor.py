@@ -17,8 +17,11 @@ def cameras(yaws, pitch, roll=0.0):
     level = Rotation.from_matrix([[1, 0, 0], [0, 0, 1], [0, -1, 0]])  # looks along y
     return np.stack(
         [
-            (Rotation.from_euler("z", yaw, degrees=True) * level * Rotation.from_euler("xz", [-pitch, roll], degrees=True))
-            .as_matrix()
+            (
+                Rotation.from_euler("z", yaw, degrees=True)
+                * level
+                * Rotation.from_euler("xz", [-pitch, roll], degrees=True)
+            ).as_matrix()
             for yaw in yaws
         ]
     )

@@ -32,7 +32,9 @@ def walk(seed=0, noise=0.0, unit=0.37, errors=True):
     rows = np.arange(RATE // FPS, len(t) - RATE // FPS, RATE // FPS)
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = (rotation[rows] * Rotation.from_matrix(T_IMU_CAMERA[:3, :3])).as_matrix()
-    poses[:, :3, 3] = position[rows] + rotation[rows].apply(T_IMU_CAMERA[:3, 3]) + noise * rng.normal(size=(len(rows), 3))
+    poses[:, :3, 3] = (
+        position[rows] + rotation[rows].apply(T_IMU_CAMERA[:3, 3]) + noise * rng.normal(size=(len(rows), 3))
+    )
     turn = Rotation.random(random_state=seed).as_matrix()
     world = np.eye(4)
     world[:3, :3] = turn
@@ -97,7 +99,7 @@ def test_a_table_of_euroc_is_read(tmp_path):
     ("row", "message"),
     [
         ("{t} 0 0 0 0 0 1", "1 g = 9.81"),
-        ("{t} 0 0 0 0 0", "expected time, three rates"),
+        ("{t} 0 0 0 0 0", "expected a time, three rates"),
         ("1 0 0 0 0 0 9.8", "ascending times"),
     ],
 )

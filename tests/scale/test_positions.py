@@ -52,7 +52,9 @@ def test_photos_without_gps_are_an_error(tmp_path):
 
 def test_positions_by_name(tmp_path):
     path = tmp_path / "places.txt"
-    path.write_text("image x y z\n# a comment\n" + "".join(f"{name}.JPG, {row}, {2 * row}, 3\n" for row, name in enumerate(NAMES)))
+    path.write_text(
+        "image x y z\n# a comment\n" + "".join(f"{name}.JPG, {row}, {2 * row}, 3\n" for row, name in enumerate(NAMES))
+    )
     found = read_positions(path, [*NAMES, "DJI_0099"], [0.0] * 6)
     assert found[:5] == pytest.approx(np.array([[row, 2 * row, 3] for row in range(5)]))
     assert np.isnan(found[5]).all()
@@ -67,7 +69,9 @@ def test_a_trajectory_of_tum_is_read_by_its_times(tmp_path):
 
 def test_geographic_positions_are_longitude_first(tmp_path):
     path = tmp_path / "geo.txt"
-    path.write_text("EPSG:4326\n" + "".join(f"{name} {10 + row / 3600} 50 {7 * row}\n" for row, name in enumerate(NAMES)))
+    path.write_text(
+        "EPSG:4326\n" + "".join(f"{name} {10 + row / 3600} 50 {7 * row}\n" for row, name in enumerate(NAMES))
+    )
     found = read_positions(path, NAMES, [0.0] * 5)
     assert found[2] == pytest.approx([2 * 19.9, 0.0, 14.0], abs=0.1)
 

@@ -17,6 +17,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from tqdm import tqdm
 
 from emgs_jax.data.base import Dataset, Frame, wait_for_all
 from emgs_jax.data.masks import check_names

@@ -1,0 +1,173 @@
+"""`scale=` on a drawn structure: a camera that walks over a floor, in a unit of its own."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from emgs_jax.scale.sources import ScaleConfig, View, metres_of
+from emgs_jax.structure.model import NONE, Structure, World
+
+UNIT, HEIGHT, FOCAL, SIZE = 0.4, 1.5, 60.0, (80, 60)  # units of a metre; metres
+COUNT = 12
+
+
+class Photos:
+    """Frames `a00.jpg` … whose images on disk are twice as large."""
+
+    intrinsics, size, raw_size = (FOCAL, FOCAL, 39.5, 29.5), SIZE, (160, 120)
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __len__(self):
+        return COUNT
+
+    def __getitem__(self, index):
+        return SimpleNamespace(timestamp=float(index))
+
+    def files(self, index):
+        return [self.folder / f"a{index:02}.jpg"]
+
+    def pixel_of(self, index, pixel):
+        return (np.asarray(pixel) + 0.5) / 2 - 0.5
+
+
+def poses():
+    """T_world_camera in metres, z up: 1.5 m above the floor, looking 40° down, turning."""
+    level = Rotation.from_matrix([[1, 0, 0], [0, 0, 1], [0, -1, 0]])
+    found = np.tile(np.eye(4), (COUNT, 1, 1))
+    for row in range(COUNT):
+        turn = Rotation.from_euler("z", 8.0 * row, degrees=True) * level * Rotation.from_euler("x", -40, degrees=True)
+        found[row, :3, :3] = turn.as_matrix()
+        found[row, :3, 3] = [0.3 * row, 0.1 * row**1.5, HEIGHT + 0.02 * (-1) ** row]
+    return found
+
+
+TURN = Rotation.from_euler("xyz", [70, 20, -40], degrees=True).as_matrix()  # of the structure's world
+
+
+def structure(world=None):
+    T = poses()
+    T[:, :3, 3] = UNIT * T[:, :3, 3]
+    whole = np.eye(4)
+    whole[:3, :3] = TURN
+    count = [0] * COUNT if world is None else world
+    worlds = [World(np.zeros((0, 3)), None)] * (max(count) + 1)
+    return Structure(worlds, np.array(count), whole @ T, np.full((COUNT, 6, 6), np.nan), [np.zeros(0, int)] * COUNT)
+
+
+def view(frame):
+    """What frame shows of the floor, in the structure's unit; 5 m and more are not known."""
+    v, u = np.mgrid[0 : SIZE[1], 0 : SIZE[0]]
+    rays = np.stack([(u - 39.5) / FOCAL, (v - 29.5) / FOCAL, np.ones(u.shape)], axis=-1)
+    T = poses()[frame]
+    down = -(rays @ T[:3, :3].T)[..., 2]
+    z = np.where(down > 0.1, T[2, 3] / np.maximum(down, 0.1), 0.0)
+    mask = (z > 0) & (z < 5)
+    return View(UNIT * np.where(mask, z, 0.0)[..., None] * rays, np.full(z.shape, 0.02), mask)
+
+
+def on_floor(frame, pixel):
+    """The world's point in metres that a pixel of the image on disk shows."""
+    u, v = (np.asarray(pixel) + 0.5) / 2 - 0.5
+    T = poses()[frame]
+    ray = T[:3, :3] @ [(u - 39.5) / FOCAL, (v - 29.5) / FOCAL, 1.0]
+    return T[:3, 3] - ray * T[2, 3] / ray[2]
+
+
+def measured(tmp_path, config, **changed):
+    return metres_of(config, Photos(tmp_path), structure(**changed), view)
+
+
+def angle(up):
+    return np.degrees(np.arccos(np.clip(up @ TURN[:, 2], -1, 1)))
+
+
+def tape(frame=3, metres=None, image=None):
+    a, b = (30.0, 80.0), (131.0, 101.0)
+    length = float(np.linalg.norm(on_floor(frame, a) - on_floor(frame, b)))
+    return [image or f"a{frame:02}.jpg", *a, *b, metres or length]
+
+
+def test_a_distance_between_pixels_of_the_image_on_disk(tmp_path):
+    (found,) = measured(tmp_path, ScaleConfig(distance=tape()))
+    assert found.scale.factor == pytest.approx(1 / UNIT, rel=0.01)
+    assert found.scale.source.startswith("distance in a03.jpg (± ")
+
+
+def test_several_distances_are_more_certain(tmp_path):
+    (one,), (three,) = (
+        measured(tmp_path, ScaleConfig(distance=given))
+        for given in ([tape()], [tape(3), tape(5), tape(7, image="a07")])
+    )
+    assert three.scale.std < 0.7 * one.scale.std
+    assert three.scale.factor == pytest.approx(1 / UNIT, rel=0.01)
+
+
+def test_the_height_above_the_floor_gives_scale_and_up(tmp_path):
+    (found,) = measured(tmp_path, ScaleConfig(height=HEIGHT))
+    assert found.scale.factor == pytest.approx(1 / UNIT, rel=0.01)
+    assert 0.015 < found.scale.std < 0.04 and angle(found.up) < 0.5
+
+
+def test_positions_give_scale_and_up(tmp_path):
+    path = tmp_path / "places.txt"
+    path.write_text("".join(f"a{row:02}.jpg {' '.join(map(str, T[:3, 3]))}\n" for row, T in enumerate(poses())))
+    (found,) = measured(tmp_path, ScaleConfig(positions=str(path)))
+    assert found.scale.factor == pytest.approx(1 / UNIT, rel=1e-4) and angle(found.up) < 0.1
+
+
+def test_sources_that_disagree_are_said(tmp_path):
+    length = tape()[-1]
+    (found,) = measured(tmp_path, ScaleConfig(distance=tape(metres=2 * length), height=HEIGHT))
+    assert any("the lengths disagree" in note for note in found.notes)
+    assert found.scale.std > 0.1
+
+
+def test_each_model_has_its_own_scale(tmp_path):
+    config = ScaleConfig(distance=tape())
+    first, second = measured(tmp_path, config, world=[0] * 6 + [1] * 6)
+    assert first.scale is not None and second.scale is None
+    assert "image a03.jpg of scale.distance has no pose in this model" in second.notes
+    with pytest.raises(ValueError, match=r"^scale: image a03.jpg of scale.distance has no pose in this model$"):
+        measured(tmp_path, config, world=[0] * 3 + [NONE] + [0] * 8)
+
+
+def test_pixels_without_depth_and_images_not_in_use_are_named(tmp_path):
+    with pytest.raises(ValueError, match=r"no depth is known at \[20, 1\] of image a03"):
+        measured(tmp_path, ScaleConfig(distance=["a03", 20, 1, 60, 110, 1.0]))
+    with pytest.raises(ValueError, match="image a99 is not in use: there are a00 to a11"):
+        measured(tmp_path, ScaleConfig(distance=["a99", 20, 100, 60, 110, 1.0]))
+
+
+def test_no_floor_is_said(tmp_path):
+    with pytest.raises(ValueError, match="no floor was found below the cameras"):
+        metres_of(
+            ScaleConfig(height=1.5),
+            Photos(tmp_path),
+            structure(),
+            lambda frame: View(*(np.zeros_like(part) for part in view(frame))),
+        )
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"distance": ["a", 1, 2, 3, 4]}, r"must be \[image, x1, y1, x2, y2, metres\]"),
+        ({"distance": ["a", 1, 2, 3, 4, -1.0]}, r"must be \[image, x1, y1, x2, y2, metres\]"),
+        ({"distance": [["a", 1, 2, 3, 4, 1.0], ["b", 1, 2, 3, 4]]}, r"scale.distance=\['b'"),
+        ({"imu": "imu.csv"}, "goes with scale.T_imu_camera"),
+    ],
+)
+def test_what_is_given_is_checked_before_images_are_read(given, message):
+    with pytest.raises(ValueError, match=message):
+        ScaleConfig(**given)
+
+
+def test_an_extrinsic_that_is_no_rigid_motion_is_named(tmp_path):
+    path = tmp_path / "imu.txt"
+    path.write_text("\n".join(f"{0.005 * row} 0 0 0 0 0 9.81" for row in range(4000)))
+    with pytest.raises(ValueError, match=r"scale.T_imu_camera must be the 16 numbers"):
+        measured(tmp_path, ScaleConfig(imu=str(path), T_imu_camera=[1.0] * 16))
