@@ -21,7 +21,7 @@ SCHEMAS = {
     "instances": "emgs_jax.evaluation.instances.InstanceConfig",
     "masks": "emgs_jax.data.masks.Masks",
     "render": "emgs_jax.render.composite.RenderConfig",
-    "scale": "emgs_jax.scale.sources.ScaleConfig",
+    "scale": "emgs_jax.scale.metres.ScaleConfig",
     "submap": "emgs_jax.gaussian_map.SubmapConfig",
     "baseline/of_tsdf": "emgs_jax.evaluation.baselines.TsdfConfig",
     "baseline/of_voxels": "emgs_jax.evaluation.baselines.VoxelConfig",

@@ -77,8 +77,8 @@ def view_from_above(poses: np.ndarray, normals: np.ndarray | None = None) -> np.
     up = up_of_cameras(poses[:, :3, :3])
     if normals is not None:
         some = normals[:: len(normals) // MAX_NORMALS + 1].astype(np.float64)
-        lengths = np.linalg.norm(some, axis=1)
-        up = up_of_surfaces(up, some / np.maximum(lengths, 1e-9)[:, None], np.float64(lengths > 0))
+        lengths = np.linalg.norm(np.nan_to_num(some), axis=1)
+        up = up_of_surfaces(up, some[lengths > 0] / lengths[lengths > 0, None], np.ones(np.sum(lengths > 0)))
     centers = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
     flat = centers - np.outer(centers @ up, up)
     # The path's longest direction points right; a camera at rest looks up the picture.

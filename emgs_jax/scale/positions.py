@@ -2,17 +2,18 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from types import ModuleType
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 from PIL import ExifTags, Image
 
+from emgs_jax.data.camera_models import load_pycolmap
 from emgs_jax.data.timestamps import in_seconds, nearest_rows
 from emgs_jax.geometry import Sim3
 from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.lines import numbers_in, words_of
-from emgs_jax.structure.library import load
 
 GEOGRAPHIC = "EPSG:4326"  # first line of a file with longitude, latitude, altitude; as ODM's geo.txt
 MAX_TIME_DIFFERENCE = 0.05  # seconds between a frame and a line with a time
@@ -72,11 +73,15 @@ def _of_exif(path: Path) -> tuple[float, float, float]:
     return angles[0] * (-1) ** south, angles[1] * (-1) ** west, altitude * (-1) ** below
 
 
+def _pycolmap() -> ModuleType:
+    return load_pycolmap("scale.positions needs pycolmap: install it from source (for Linux on ARM there is no wheel)")
+
+
 def _in_metres(geographic: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
     """Turn latitude, longitude, altitude into metres east, north and up of the first known one."""
     is_known = np.isfinite(geographic).all(axis=1)
     found = np.full(geographic.shape, np.nan)
-    found[is_known] = load().GPSTransform().ellipsoid_to_enu(geographic[is_known], *geographic[is_known][0])
+    found[is_known] = _pycolmap().GPSTransform().ellipsoid_to_enu(geographic[is_known], *geographic[is_known][0])
     return found
 
 
@@ -146,7 +151,7 @@ def scale_of_positions(centers: Float[np.ndarray, "n 3"], positions: Float[np.nd
     Raises:
         ValueError: too few positions, or they lie no farther apart than they err.
     """
-    pycolmap = load()
+    pycolmap = _pycolmap()
     is_known = np.isfinite(centers).all(axis=1) & np.isfinite(positions).all(axis=1)
     if is_known.sum() < MIN_POSITIONS:
         raise ValueError(

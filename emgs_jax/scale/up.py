@@ -36,11 +36,11 @@ def up_of_surfaces(
         up: unit vector, within about 20° of the truth.
         normals: unit vectors.
     """
-    if not len(normals):
-        return up
     for width in np.radians(WIDTHS_DEG).repeat(NUM_STEPS):
         angle = np.arccos(np.clip(np.abs(normals @ up), 0.0, 1.0))
         along, across = (areas * np.exp(-0.5 * (off / width) ** 2) for off in (angle, np.pi / 2 - angle))
+        if not along.any() and not across.any():
+            return up
         open_as_before = OPEN * (along.sum() + across.sum()) * np.outer(up, up)
         _, vectors = np.linalg.eigh(((across - along)[:, None] * normals).T @ normals - open_as_before)
         up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)

@@ -34,7 +34,7 @@ from emgs_jax.prior.multiview.matched import begin_matched
 from emgs_jax.prior.multiview.monocular_network import MeterConfig, way_of_meter
 from emgs_jax.prior.multiview.swept import SweptConfig, swept
 from emgs_jax.prior.sources import placed_beside, sources_of
-from emgs_jax.scale.sources import ScaleConfig, View, metres_of
+from emgs_jax.scale.metres import ScaleConfig, View, metres_of
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import names_at
 from emgs_jax.structure.model import NONE, Structure, scaled
@@ -162,7 +162,10 @@ class MultiviewStereo(Prior):
             points, confidence, mask = self._answer(frame)
             return View(points, 1.0 / confidence, mask)
 
-        found, depths = metres_of(self._metres, self._dataset, self._found, view), self._depths
+        found, depths = (
+            metres_of(self._metres, self._dataset, self._found.T_world_camera, self._found.world, view),
+            self._depths,
+        )
         factors = np.ones(len(found))
         for world, (scale, _, notes) in enumerate(found):
             of = f" of model {world}" if len(found) > 1 else ""

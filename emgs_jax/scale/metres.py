@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.data.euroc import read_sensor
@@ -18,7 +18,6 @@ from emgs_jax.scale.inertial import read_inertial, scale_of_motion
 from emgs_jax.scale.positions import positions_of_exif, read_positions, scale_of_positions
 from emgs_jax.scale.tape import point_at, scale_of_distance
 from emgs_jax.scale.up import up_of_cameras, up_of_surfaces
-from emgs_jax.structure.model import Structure
 
 NUM_VIEWS = 24  # frames in which a floor is looked for, evenly spread
 PIXELS = 60  # of a frame's longer side, whose surfaces are used
@@ -81,14 +80,27 @@ class Metres(NamedTuple):
     notes: tuple[str, ...]
 
 
-def metres_of(config: ScaleConfig, dataset: Dataset, structure: Structure, view: Callable[[int], View]) -> list[Metres]:
+def metres_of(
+    config: ScaleConfig,
+    dataset: Dataset,
+    poses: Float[np.ndarray, "n 4 4"],
+    world: Int[np.ndarray, " n"],
+    view: Callable[[int], View],
+) -> list[Metres]:
     """Find scale and up of each world of a structure, by all sources that are given.
+
+    Args:
+        poses: T_world_camera of each frame, in the unit of its world; NaN without one.
+        world: number of each frame's world, from 0; -1 without one.
+        view: what a frame with a pose shows.
 
     Raises:
         ValueError: a source cannot be read, or says nothing of any world.
     """
     names = image_names(*files_of(dataset))
-    found = [_of_world(config, dataset, structure, world, names, view) for world in range(len(structure.worlds))]
+    found = [
+        _of_world(config, dataset, poses, np.flatnonzero(world == one), names, view) for one in range(max(world) + 1)
+    ]
     if all(one.scale is None for one in found):
         raise ValueError("scale: " + "; ".join(note for one in found for note in one.notes))
     return found
@@ -97,13 +109,12 @@ def metres_of(config: ScaleConfig, dataset: Dataset, structure: Structure, view:
 def _of_world(
     config: ScaleConfig,
     dataset: Dataset,
-    structure: Structure,
-    world: int,
+    all_poses: Float[np.ndarray, "n 4 4"],
+    frames: Int[np.ndarray, " k"],
     names: Sequence[str],
     view: Callable[[int], View],
 ) -> Metres:
-    frames = np.flatnonzero(structure.world == world)
-    poses, focal = structure.T_world_camera[frames], dataset.intrinsics[0]
+    poses, focal = all_poses[frames], dataset.intrinsics[0]
     up, scales, notes = up_of_cameras(poses[:, :3, :3]), [], []
     for image, *pixels, metres in config.distances:
         frame = _frame_of(str(image), names)

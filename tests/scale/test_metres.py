@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.scale.sources import ScaleConfig, View, metres_of
-from emgs_jax.structure.model import NONE, Structure, World
+from emgs_jax.scale.metres import ScaleConfig, View, metres_of
 
 UNIT, HEIGHT, FOCAL, SIZE = 0.4, 1.5, 60.0, (80, 60)  # units of a metre; metres
 COUNT = 12
@@ -53,9 +52,7 @@ def structure(world=None):
     T[:, :3, 3] = UNIT * T[:, :3, 3]
     whole = np.eye(4)
     whole[:3, :3] = TURN
-    count = [0] * COUNT if world is None else world
-    worlds = [World(np.zeros((0, 3)), None)] * (max(count) + 1)
-    return Structure(worlds, np.array(count), whole @ T, np.full((COUNT, 6, 6), np.nan), [np.zeros(0, int)] * COUNT)
+    return whole @ T, np.array([0] * COUNT if world is None else world)
 
 
 def view(frame):
@@ -78,7 +75,7 @@ def on_floor(frame, pixel):
 
 
 def measured(tmp_path, config, **changed):
-    return metres_of(config, Photos(tmp_path), structure(**changed), view)
+    return metres_of(config, Photos(tmp_path), *structure(**changed), view)
 
 
 def angle(up):
@@ -132,7 +129,7 @@ def test_each_model_has_its_own_scale(tmp_path):
     assert first.scale is not None and second.scale is None
     assert "image a03.jpg of scale.distance has no pose in this model" in second.notes
     with pytest.raises(ValueError, match=r"^scale: image a03.jpg of scale.distance has no pose in this model$"):
-        measured(tmp_path, config, world=[0] * 3 + [NONE] + [0] * 8)
+        measured(tmp_path, config, world=[0] * 3 + [-1] + [0] * 8)
 
 
 def test_pixels_without_depth_and_images_not_in_use_are_named(tmp_path):
@@ -147,7 +144,7 @@ def test_no_floor_is_said(tmp_path):
         metres_of(
             ScaleConfig(height=1.5),
             Photos(tmp_path),
-            structure(),
+            *structure(),
             lambda frame: View(*(np.zeros_like(part) for part in view(frame))),
         )
 
