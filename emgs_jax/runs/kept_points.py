@@ -30,8 +30,7 @@ class Moved:
 def read_points(path: Path) -> PointCloud:
     """Read the points.ply of a run; a normal of zero stays unknown."""
     vertices = read_vertices(path)
-    rows = (np.stack([vertices[name] for name in names], 1).astype(np.float64) for names in COLUMNS)
-    points, normals, colors = rows
+    points, normals, colors = (np.stack([vertices[name] for name in names], 1).astype(np.float64) for names in COLUMNS)
     return PointCloud(points, normals, colors / 255.0)
 
 
