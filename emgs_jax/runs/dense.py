@@ -93,7 +93,7 @@ def dense_map(
                 normals = np.where(normals[kept].any(-1, keepdims=True), normals[kept], seen.normals)
                 yield PointCloud(seen.points, normals, seen.colors)
 
-    cloud = fuse_clouds(clouds(), _voxel(with_truth(run, run.poses), evaluation))
+    cloud = fuse_clouds(clouds(), voxel_of(with_truth(run, run.poses), evaluation))
     points = cloud.points
     labels = None if labelled is None else LabelledPoints(points, labelled.classes_of(points), labelled.classes)
     return DenseMap(cloud, labels, pictures, rendered.metrics())
@@ -128,7 +128,7 @@ def uncontradicted(
     return (depth > 0) & (is_near | ~is_shown), np.where(is_shown[..., None], normals, 0.0)
 
 
-def _voxel(poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig) -> float:
+def voxel_of(poses: tuple[np.ndarray, np.ndarray] | None, config: EvaluationConfig) -> float:
     """Compute a voxel's side in the map's lengths: `voxel_m`, of the truth if the map's unit is larger than a metre."""
     if poses is None:
         return config.voxel_m

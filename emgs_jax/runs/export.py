@@ -19,10 +19,9 @@ from emgs_jax.io.ply_reader import read_vertices, scale_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.ranges import number, one_of
-from emgs_jax.runs.finished_run import FinishedRun
+from emgs_jax.runs.finished_run import POINTS_FILE, FinishedRun
 from emgs_jax.runs.moving import moving_mask
 
-POINTS_FILE = "points.ply"
 FORMATS = {"colmap": "colmap", "nerfstudio": "nerfstudio", "frustums": "cameras.ply"}  # and what is written
 IMAGE_FORMATS = {"colmap", "nerfstudio"}
 TRAJECTORIES, CLOUDS = ("trajectory.txt", "trajectory_online.txt"), ("map.ply", "points.ply", "mesh.ply")

@@ -25,6 +25,7 @@ TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `expe
 LOOPS_FILE = "loops.json"
 REPORT_FILE = "report.html"
 FRAMES_FILE = "frames.jsonl"
+POINTS_FILE = "points.ply"
 SPLATS_FILE = "splats.ply"
 POLISH = (SPLATS_FILE, "polish.json", "polish.png", "polish.npz", "polish.txt")  # of `experiments.polish`
 EXPORTS = ("colmap", "nerfstudio", "cameras.ply", "scaled")  # what `experiments.export` writes beside them

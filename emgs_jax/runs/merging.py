@@ -14,6 +14,8 @@ from emgs_jax.back_end.state import BackEnd, Node
 from emgs_jax.config.configure import CONF, build, build_dataset, compose, graph_config, message_of
 from emgs_jax.data.joined import common_camera, joined_name
 from emgs_jax.data.readable import ReadableFrames
+from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
+from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.features.text import save_text
 from emgs_jax.io.files import FrameLog, new_folder
 from emgs_jax.io.trajectory import from_tum
@@ -21,11 +23,12 @@ from emgs_jax.mapping.atlas import Atlas, set_unjoined_apart, unvisited
 from emgs_jax.mapping.integrate import finish_back_end
 from emgs_jax.mapping.merging import beside, join, motion, with_lost
 from emgs_jax.mapping.records import FrameRecord, to_line, with_moved_nodes, with_unjoined_apart
-from emgs_jax.mapping.run import MappingRun
+from emgs_jax.mapping.run import MappingRun, with_truth
 from emgs_jax.ops.camera import Camera
-from emgs_jax.runs.dense import DenseMap, center_cloud, dense_map
+from emgs_jax.runs.dense import DenseMap, center_cloud, dense_map, voxel_of
 from emgs_jax.runs.files import save_outputs, save_progress
-from emgs_jax.runs.finished_run import FRAMES_FILE, TEXT_FILE, FinishedRun, read_run
+from emgs_jax.runs.finished_run import FRAMES_FILE, POINTS_FILE, TEXT_FILE, FinishedRun, read_run
+from emgs_jax.runs.kept_points import moved_parts, moved_points, read_points
 from emgs_jax.runs.metrics import Scorer, describe, score_back_end, score_map, true_cloud
 from emgs_jax.runs.provenance import git_now, write_metrics
 from emgs_jax.runs.repeat import repeat
@@ -183,7 +186,9 @@ def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[d
     read = [mergeable(folder) for folder in folders]
     run, order, reasons = merged(read, has_truth)
     parts = [read[number].finished for number in order]
-    origin, dataset, note = _origin(parts, has_truth)
+    joined = [read[number] for number in order if number not in reasons]
+    keeps_points = all(_has_own_points(one.finished) for one in joined)
+    origin, dataset, note = _origin(parts, has_truth, "own" if keeps_points else "map")
     config = config_of(parts[0])
     densify, evaluation = replace(build(config, "densify"), points="map"), build(config, "evaluation")
     (width, height), (fx, fy, cx, cy) = origin["data"]["frames"].values()
@@ -193,10 +198,11 @@ def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[d
             for record in run.records:
                 log.append(to_line(record))
         save_progress(new, run)
-        if dataset is None:
-            metrics, dense = {}, DenseMap(center_cloud(run))
-        else:
-            dense = dense_map(run, dataset, densify, evaluation)
+        dense = DenseMap(center_cloud(run)) if dataset is None else dense_map(run, dataset, densify, evaluation)
+        if keeps_points:
+            dense = replace(dense, cloud=kept_cloud(joined, run, evaluation))
+        metrics = {}
+        if dataset is not None:
             scorer = Scorer(dataset, evaluation, true_cloud(dataset, evaluation), None, None)
             metrics = score_map(run, dense.cloud, center_cloud(run), None, scorer) | dense.rendering
         title, unit = f"{len(order) - len(reasons)} runs merged", "m" if parts[0].is_metric else "units"
@@ -209,14 +215,30 @@ def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[d
     return metrics, [*apart, *notes, *filter(None, [note])]
 
 
-def _origin(parts: Sequence[FinishedRun], has_truth: bool) -> tuple[dict[str, Any], ReadableFrames | None, str]:
-    """Make the provenance of a merged run, its images, and the reason if there are none."""
+def kept_cloud(parts: Sequence[MergeableRun], run: MappingRun, evaluation: EvaluationConfig) -> PointCloud:
+    """Average the points of all joined runs, moved into their common map, in voxels."""
+    moved = moved_parts([part.atlas for part in parts], run.atlas.graph.nodes)
+    clouds = (
+        moved_points(read_points(part.finished.folder / POINTS_FILE), one, part.atlas.graph.config.deform)
+        for part, one in zip(parts, moved, strict=True)
+    )
+    return fuse_clouds(clouds, voxel_of(with_truth(run, run.poses), evaluation))
+
+
+def _has_own_points(run: FinishedRun) -> bool:
+    return run.provenance["config"]["densify"].get("points") == "own" and (run.folder / POINTS_FILE).is_file()
+
+
+def _origin(
+    parts: Sequence[FinishedRun], has_truth: bool, points: str
+) -> tuple[dict[str, Any], ReadableFrames | None, str]:
+    """Make the provenance of a merged run with such `points`, its images, and the reason if there are none."""
     first = parts[0].provenance
     settings = OmegaConf.to_container(OmegaConf.create(dict(first["config"])), resolve=True)
     images = {"_target_": OmegaConf.load(CONF / "merge.yaml").dataset["_target_"], "has_truth": has_truth}
     images |= {"runs": [str(one.folder.resolve()) for one in parts]}
     settings |= {"dataset": images, "map": None, "on_bad_frame": "error"}
-    settings["densify"] |= {"points": "map"}  # those of the frames are not kept
+    settings["densify"] |= {"points": points}
     if "masks" in settings:
         settings["masks"] |= {"folder": None, "classes": None, "names": None}  # each run has its own
     try:

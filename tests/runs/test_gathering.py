@@ -14,7 +14,7 @@ from emgs_jax.evaluation.reconstruction import compare_clouds, ground_truth_clou
 from emgs_jax.evaluation.segmentation import align_labels
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.mapping.window_input import RawView
-from emgs_jax.runs.dense import _voxel
+from emgs_jax.runs.dense import voxel_of
 from emgs_jax.runs.gathering import Baselines, gather
 from emgs_jax.runs.metrics import Scorer, score_baselines
 
@@ -181,8 +181,8 @@ def test_the_map_is_averaged_by_a_centimetre_of_the_truth_and_never_by_more_than
     for unit, side in ((1.0, 1.0), (40.0, 1 / 40), (0.001, 1.0)):
         own = true.copy()
         own[:, :3, 3] /= unit
-        assert _voxel((own, true), config) == pytest.approx(side * config.voxel_m)
-    assert _voxel(None, config) == config.voxel_m
+        assert voxel_of((own, true), config) == pytest.approx(side * config.voxel_m)
+    assert voxel_of(None, config) == config.voxel_m
 
 
 def test_what_goes_wrong_in_gathering_ends_the_mapping_one_frame_later():
