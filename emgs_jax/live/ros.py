@@ -30,12 +30,7 @@ from emgs_jax.live.transforms import Transforms, bare, stamp_of
 INFO_S = 30.0  # longest wait for the camera_info
 TOPICS = ("image", "camera_info", "depth", "odometry")
 PUBLISHED = ("map", "map_update", "path", "pose", "diagnostics", "save", "reset")  # by `viewer.ros`
-PARAMETERS = {
-    "odom_frame": "",
-    "camera_frame": "",
-    "map_frame": "map",
-    "publish_tf": True,
-}  # of the nodes, and defaults
+PARAMETERS = {"odom_frame": "", "camera_frame": "", "map_frame": "map", "publish_tf": True}  # defaults of the nodes
 BAYER = {"bayer_rggb8": cv2.COLOR_BayerBG2RGB, "bayer_bggr8": cv2.COLOR_BayerRG2RGB}
 BAYER |= {"bayer_gbrg8": cv2.COLOR_BayerGR2RGB, "bayer_grbg8": cv2.COLOR_BayerGB2RGB}
 MILLIMETRE = 1e-3

@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from emgs_jax.data.base import Dataset
+from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import FrameLog, new_folder
 from emgs_jax.mapping.pipeline import finish_run
 from emgs_jax.mapping.records import to_line
@@ -21,7 +21,7 @@ from emgs_jax.runs.results import METRICS_FILE
 def save_snapshot(
     folder: Path,
     run: MappingRun,
-    sources: tuple[Dataset, Prior],
+    sources: tuple[ReadableFrames, Prior],
     origin: Mapping[str, Any],
     recorded: str | None = None,
 ) -> Path:
@@ -49,7 +49,7 @@ def save_snapshot(
     with new_folder(target) as new:
         with FrameLog(new / FRAMES_FILE) as log:
             for record in done.records:
-                log.append(to_line(record) | {"index": record.index})
+                log.append(to_line(record) | {"index": dataset.kept[record.index]})
         save_progress(new, done)
         save_classes(new, prior)
         write_metrics(new / METRICS_FILE, describe(done) | {"provenance": {**origin, "config": config}})
