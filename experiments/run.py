@@ -19,6 +19,7 @@ from emgs_jax.device.clock import Clock
 from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog, owned
 from emgs_jax.io.packages import extra
+from emgs_jax.live.camera import RECORDED
 from emgs_jax.live.newest import end_all
 from emgs_jax.mapping.capacity import prepared_beside
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
@@ -49,8 +50,9 @@ from emgs_jax.runs.metrics import (
 )
 from emgs_jax.runs.polished import OPTAX, polish
 from emgs_jax.runs.provenance import described, is_metric, provenance, signature, write_metrics
+from emgs_jax.runs.snapshot import save_snapshot
 from emgs_jax.viewer.live import LiveView, live_view
-from emgs_jax.viewer.ros import RosConfig, RosView, ros_view
+from emgs_jax.viewer.ros import NewMapError, RosConfig, RosView, ros_view
 
 from .command import command
 from .interrupt import cameras_first
@@ -91,16 +93,20 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             fitting = build(config, "polish") if config.polish else None
             if fitting is not None:
                 extra(*OPTAX)
-            if isinstance(watched, RosConfig):
-                words = str(config.dataset.get("source", "")).split()[1:]
-                live = stack.enter_context(ros_view(watched, folder, words, has_saved_map=saved is not None))
-            else:
-                live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
             baselines = Baselines(fused, slam.observation, dataset)
             settings = OmegaConf.to_container(config, resolve=True)
             origin = provenance(settings, dataset, prior.provenance)
             if saved is not None:
                 origin["map"] = saved.checksum
+            if isinstance(watched, RosConfig):
+                words = str(config.dataset.get("source", "")).split()[1:]
+
+                def save(run: MappingRun, is_last: bool) -> Path:
+                    return save_snapshot(folder, run, (dataset, prior), origin, RECORDED if is_last else None)
+
+                live = stack.enter_context(ros_view(watched, words, save, has_saved_map=saved is not None))
+            else:
+                live = stack.enter_context(live_view(watched, session, densify.render, prior, dataset.kept))
             # Frames of a camera do not come again.
             checkpoint = None if "record" in config.dataset else build(config, "checkpoint")
             keeper = Keeper(folder / CHECKPOINT_FILE, checkpoint, signature(origin))
@@ -190,7 +196,7 @@ def _map(
                     show_records(bar, run.records, len(new), dataset.progress_words)
                     for record, view in zip(new, views, strict=True):
                         if live is not None:
-                            live.show(run, view.image)
+                            live.show(run, view.image, dataset.rates)
                         yield record, view
 
         for index, reason in dataset.skipped.items():
@@ -198,8 +204,11 @@ def _map(
         try:
             # Closed, so that an error while gathering ends the mapping before its results are written.
             with contextlib.closing(frames()) as mapped, start.clock.phase("raw_prior"):
-                raw = gather(mapped, evaluation, keeps_points, baselines, compared_text(dataset, prior))
+                has_truth = any(dataset.pose(index) is not None for index in range(len(dataset)))
+                raw = gather(mapped, evaluation, keeps_points, baselines, compared_text(dataset, prior), has_truth)
             run = finish_run(run)
+        except NewMapError:  # this one is saved
+            raise
         except BaseException:
             with contextlib.suppress(OSError, ValueError):  # the first error is the one to show
                 run = finish_run(run, is_interrupted=True)

@@ -37,6 +37,18 @@ class Frame:
         return self.depth if self.moving is None else np.where(self.moving == STAYS, self.depth, np.float32(0.0))
 
 
+@dataclass(frozen=True)
+class Rates:
+    """How the images of a camera are mapped: maps a second of late, images dropped so far, seconds behind."""
+
+    maps_per_second: float
+    num_dropped: int
+    behind_s: float
+
+    def __str__(self) -> str:
+        return f"{self.maps_per_second:.1f} maps/s, {self.num_dropped} dropped, {self.behind_s:.1f} s behind"
+
+
 @runtime_checkable
 class Dataset(Protocol):
     """A sequence of frames. Construction checks the layout; `dataset[i]` reads frame i and may raise BadFrameError.
@@ -77,6 +89,11 @@ class Dataset(Protocol):
     def progress_words(self, index: int) -> str:
         """Return words for the progress bar after frame `index` is mapped."""
         return ""
+
+    @property
+    def rates(self) -> Rates | None:
+        """How the last frame was mapped, of which `progress_words` was told; None where images do not pass."""
+        return None
 
     def report(self) -> dict[str, float]:
         """Return statistics of how the frames came, as keys `camera/…`."""

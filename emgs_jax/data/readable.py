@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from emgs_jax.data.base import BadFrameError, Dataset, Frame
+from emgs_jax.data.base import BadFrameError, Dataset, Frame, Rates
 from emgs_jax.data.masks import MANY, Masks, check_names, files_of, masked, stem
 from emgs_jax.data.reading import is_turned_unseen, read_bytes
 from emgs_jax.data.spool import Spool
@@ -91,6 +91,11 @@ class ReadableFrames:
     def progress_words(self, index: int) -> str:
         """Return words for the progress bar after frame `index` is mapped."""
         return self._dataset.progress_words(self.kept[index])
+
+    @property
+    def rates(self) -> Rates | None:
+        """How the last frame was mapped; None where images do not pass."""
+        return self._dataset.rates
 
     def report(self) -> dict[str, float]:
         """Return statistics of how the frames came, as keys `camera/…`."""

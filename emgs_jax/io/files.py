@@ -94,11 +94,11 @@ def check_writable(path: Path, what: str) -> None:
 
 
 def remove_temporaries(folder: Path) -> list[str]:
-    """Remove what killed processes left of an `atomic_write` into `folder`; return the names."""
+    """Remove what killed processes left in `folder` of an `atomic_write` or of a camera; return the names."""
     found = [(path, re.fullmatch(r"\..+\.(\d+)\.tmp(\..*)?", path.name)) for path in sorted(folder.glob(".*.tmp*"))]
     dead = [path for path, name in found if name and not _is_running(int(name[1]))]
     for path in dead:
-        path.unlink(missing_ok=True)
+        shutil.rmtree(path) if path.is_dir() else path.unlink(missing_ok=True)
     return [path.name for path in dead]
 
 

@@ -4,6 +4,7 @@ Each image that is taken becomes a file, with what came beside it (depth, pose) 
 memory is bounded, and the same command on the folder maps the same frames again (`prior=stream`).
 """
 
+import os
 import tempfile
 import time
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ import cv2
 import numpy as np
 from tqdm import tqdm
 
-from emgs_jax.data.base import wait_for_all
+from emgs_jax.data.base import Rates, wait_for_all
 from emgs_jax.data.images import Images
 from emgs_jax.data.intrinsics import Given, Pictures, find_lens, to_lens
 from emgs_jax.data.reading import Size, about_pixels
@@ -56,6 +57,7 @@ class Camera(Straightened):
     def __post_init__(self) -> None:
         self._newest, self._is_over, self._is_live = Newest(), False, False
         self._images, self._times, self._arrived, self._mapped = [], [], [], []
+        self._rates: Rates | None = None
         self.sequence, self._given = str(self.source), self.intrinsics  # `_use` replaces the latter
         if self._given == "exif" or (self._given is None and not is_ros(self.sequence)):
             raise ValueError(NO_INTRINSICS)
@@ -91,7 +93,7 @@ class Camera(Straightened):
 
     def _new_folder(self) -> Path:
         if not self.record:  # deleted with this object
-            self._temporary = tempfile.TemporaryDirectory(prefix=".camera_", dir=self.folder)
+            self._temporary = tempfile.TemporaryDirectory(prefix=f".camera.{os.getpid()}.tmp.", dir=self.folder)
             return Path(self._temporary.name)
         if self.folder is None:
             raise ValueError("dataset.record=true needs the folder of a run: give Camera its folder")
@@ -196,8 +198,12 @@ class Camera(Straightened):
         self._mapped.append(time.monotonic())
         recent = self._mapped[-NUM_TIMED:]
         rate = (len(recent) - 1) / max(recent[-1] - recent[0], 1e-9)
-        behind = recent[-1] - self._arrived[index]
-        return f"{rate:.1f} maps/s, {self._newest.num_dropped} dropped, {behind:.1f} s behind"
+        self._rates = Rates(rate, self._newest.num_dropped, recent[-1] - self._arrived[index])
+        return str(self._rates)
+
+    @property
+    def rates(self) -> Rates | None:
+        return self._rates
 
     def report(self) -> dict[str, float]:
         if not self._is_live:

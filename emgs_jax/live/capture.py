@@ -3,6 +3,7 @@
 A thread waits for the images, and `Newest` keeps one until the map takes it.
 """
 
+import itertools
 import os
 import threading
 import time
@@ -75,9 +76,12 @@ def open_source(source: str, into: Newest) -> Iterator[Shot]:
 
 
 def _of_device(capture: cv2.VideoCapture) -> Iterator[Shot]:
+    """Yield the images of a camera; ValueError if there is none: one that is held by another program can be opened."""
     try:
-        while True:
+        for number in itertools.count():
             is_read, image = capture.read()
+            if not is_read and number == 0:
+                raise ValueError("it is there and gives no image, as where another program holds it")
             if not is_read:
                 return
             yield Shot(time.time(), cv2.cvtColor(image, cv2.COLOR_BGR2RGB))

@@ -1,7 +1,7 @@
 """Join the messages of one moment: an image, its depth, and the pose between two messages of odometry."""
 
 from bisect import bisect_left
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -13,18 +13,22 @@ KEPT_S = 3.0  # messages of each kind; an image that nothing fits is left out by
 BACK_S = 1.0  # a stamp so far before the newest of its kind begins anew: a bag that is played again
 
 
+Find = Callable[[list[tuple[float, Any]], float], Any | None]  # in messages, by order of time, what is of a time
+
+
 class Joined:
     """Images that wait for what belongs to them.
 
     Args:
         kinds: what an image needs beside it: "depth" and "pose", one of them, or none.
+        find: how it is found where not by `FIND`, by kind.
 
     Attributes:
         num_alone: images that were left out because something did not come.
     """
 
-    def __init__(self, kinds: set[str]) -> None:
-        self._kinds, self.num_alone = kinds, 0
+    def __init__(self, kinds: set[str], find: Mapping[str, Find] = {}) -> None:
+        self._kinds, self.num_alone, self._find = kinds, 0, {**FIND, **find}
         self._waiting: dict[str, list[tuple[float, Any]]] = {kind: [] for kind in ("image", *kinds)}
 
     def add(self, kind: str, time_s: float, value: Any) -> Iterator[tuple[float, dict[str, Any]]]:
@@ -57,7 +61,7 @@ class Joined:
         """What belongs to an image of this time; None if something has not come yet."""
         found = {}
         for kind in sorted(self._kinds):  # a pose between two takes long, and odometry comes often
-            value = FIND[kind](self._waiting[kind], time_s)
+            value = self._find[kind](self._waiting[kind], time_s)
             if value is None:
                 return None
             found[kind] = value
@@ -88,4 +92,4 @@ def pose_at(poses: list[tuple[float, np.ndarray]], time_s: float) -> np.ndarray 
     return pose
 
 
-FIND = {"depth": nearest, "pose": pose_at}
+FIND: dict[str, Find] = {"depth": nearest, "pose": pose_at}

@@ -1,13 +1,14 @@
 """Images of ROS 2 topics, with their depth and the odometry of the camera, as a source of `Camera`.
 
 `rclpy` is the robot's own where there is one, else that of the extra `ros`. Topics are named `image`, `camera_info`,
-`depth` and `odometry`, and remapped as in ROS: `image:=/camera/color/image_raw`.
+`depth` and `odometry`, and remapped as in ROS: `image:=/camera/color/image_raw`. Parameters of the node are given
+likewise: `odom_frame:=odom`.
 """
 
 import contextlib
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from queue import Queue
 from types import ModuleType
@@ -18,39 +19,53 @@ import numpy as np
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.camera_models import Calibration
-from emgs_jax.data.reading import rigid
+from emgs_jax.data.reading import damage, rigid
 from emgs_jax.data.rosbag import calibration_of, to_rgb
 from emgs_jax.data.tones import ALL_16_BITS
 from emgs_jax.io.packages import extra
 from emgs_jax.live.joined_messages import Joined
 from emgs_jax.live.newest import Newest, Shot
+from emgs_jax.live.transforms import Transforms, bare, stamp_of
 
 INFO_S = 30.0  # longest wait for the camera_info
 TOPICS = ("image", "camera_info", "depth", "odometry")
-PUBLISHED = ("map", "map_update", "path", "pose", "diagnostics", "save")  # by `viewer.ros`
+PUBLISHED = ("map", "map_update", "path", "pose", "diagnostics", "save", "reset")  # by `viewer.ros`
+PARAMETERS = {"odom_frame": "", "camera_frame": "", "map_frame": "map", "publish_tf": True}  # defaults of the nodes
 BAYER = {"bayer_rggb8": cv2.COLOR_BayerBG2RGB, "bayer_bggr8": cv2.COLOR_BayerRG2RGB}
 BAYER |= {"bayer_gbrg8": cv2.COLOR_BayerGR2RGB, "bayer_grbg8": cv2.COLOR_BayerGB2RGB}
 MILLIMETRE = 1e-3
+COMPRESSED_HEADER = 12  # bytes of compressed_depth_image_transport: a format, and two numbers of its quantization
 
 
 def new_node(name: str, words: Sequence[str]) -> tuple[ModuleType, Any]:
-    """Return rclpy and a node of it with remappings like `image:=/camera/image_raw` or `__ns:=/robot`.
+    """Return rclpy and a node of it with remappings like `image:=/camera/image_raw` or `__ns:=/robot`, and parameters.
 
     Raises:
-        ValueError: rclpy is not installed, or a word is no remapping.
+        ValueError: rclpy is not installed, or a word is neither.
     """
     rclpy = extra("rclpy", "ROS 2 needs rclpy, the robot's own (source its setup.bash) or", "ros")
     for word in words:
         what, is_remapping, topic = word.partition(":=")
-        if not is_remapping or what not in (*TOPICS, *PUBLISHED, "__ns") or not topic:
-            known = ", ".join((*TOPICS, *PUBLISHED, "__ns"))
-            raise ValueError(f"{word} is no remapping NAME:=TOPIC of one of {known}")
+        if not is_remapping or what not in (*TOPICS, *PUBLISHED, "__ns", *PARAMETERS) or not topic:
+            known, parameters = ", ".join((*TOPICS, *PUBLISHED, "__ns")), ", ".join(PARAMETERS)
+            raise ValueError(f"{word} is no remapping NAME:=TOPIC of one of {known}, nor one of {parameters}")
     if not rclpy.ok():
         from rclpy.signals import SignalHandlerOptions
 
         rclpy.init(args=["emgs"], signal_handler_options=SignalHandlerOptions.NO)  # Ctrl-C is the command's
-    remapped = [part for word in words for part in ("-r", word)]
-    return rclpy, rclpy.create_node(name, cli_args=["--ros-args", *remapped] if remapped else [])
+    given = [part for word in words for part in ("-p" if word.partition(":=")[0] in PARAMETERS else "-r", word)]
+    return rclpy, rclpy.create_node(name, cli_args=["--ros-args", *given] if given else [])
+
+
+def parameter(node: Any, name: str) -> Any:
+    """Return a parameter of a node; ValueError if what was given for it is of another type than its default."""
+    from rclpy.exceptions import InvalidParameterTypeException
+
+    try:
+        return node.declare_parameter(name, PARAMETERS[name]).value
+    except InvalidParameterTypeException as error:
+        kind = {str: "a name", bool: "true or false"}[type(PARAMETERS[name])]
+        raise ValueError(f"{name}:= must be {kind}") from error
 
 
 def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibration | None:
@@ -66,7 +81,17 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
 
     topics = dict(word.split(":=") for word in words)
     kinds = {kind for kind, name in (("depth", "depth"), ("pose", "odometry")) if name in topics}
-    joined, frames, infos = Joined(kinds), Frames(), Queue()
+    odom_frame = bare(parameter(node, "odom_frame"))
+    frames, infos, find = Frames(parameter(node, "camera_frame")), Queue(), {}
+    if odom_frame and "odometry" in topics:
+        raise ValueError(
+            f"odometry:={topics['odometry']} and odom_frame:={odom_frame} are two sources of poses, a topic and /tf: "
+            "give one"
+        )
+    if odom_frame:
+        kinds.add("pose")
+        find["pose"] = lambda _, time_s: frames.transforms.pose(frames.camera, odom_frame, time_s)
+    joined = Joined(kinds, find)
 
     def add(kind: str, message: Any) -> None:
         num_alone = joined.num_alone
@@ -75,12 +100,21 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
         except (BadFrameError, ValueError) as error:
             into.problem = str(error)
             return
-        for time_s, found in joined.add(kind, stamp_of(message), value):
+        put(joined.add(kind, stamp_of(message), value), num_alone)
+
+    def put(whole: Iterator[tuple[float, dict[str, Any]]], num_alone: int) -> None:
+        for time_s, found in whole:
             given = {name: found[kind] for kind, name in GIVEN.items() if kind in found}
             into.problem = None
             into.put(Shot(time_s, found["image"], given or None))
         if joined.num_alone > num_alone:
             into.problem = f"{joined.num_alone} images had no {' or '.join(sorted(kinds))} of their time"
+            if odom_frame and not frames.transforms.way(frames.camera, odom_frame):
+                into.problem = f"/tf does not lead from {odom_frame} to {frames.camera or 'a frame in the images'}"
+
+    def add_moving(message: Any) -> None:
+        for time_s in frames.transforms.add_moving(message, frames.camera, odom_frame):
+            put(joined.add("pose", time_s, None), joined.num_alone)
 
     image_type = CompressedImage if topics.get("image", "").endswith("compressed") else Image
     quality, info_topic = qos_profile_sensor_data, node.resolve_topic_name("camera_info")
@@ -88,16 +122,21 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
     if needs_camera:
         node.create_subscription(CameraInfo, "camera_info", infos.put, quality)
     if "depth" in kinds:
-        node.create_subscription(Image, "depth", partial(add, "depth"), quality)
-    if "pose" in kinds:
+        depth_type = CompressedImage if topics["depth"].endswith("compressedDepth") else Image
+        node.create_subscription(depth_type, "depth", partial(add, "depth"), quality)
+    if "odometry" in topics:
         from nav_msgs.msg import Odometry
 
         node.create_subscription(Odometry, "odometry", partial(add, "pose"), quality)
-        with contextlib.suppress(ImportError):  # not among the wheels of the extra
-            from tf2_msgs.msg import TFMessage
-
+    if "pose" in kinds:
+        tf_type = message_of_tf()
+        if tf_type is None and odom_frame:
+            raise ValueError(f"odom_frame:={odom_frame} takes poses from /tf, which needs the package tf2_msgs")
+        if tf_type is not None:
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            node.create_subscription(TFMessage, "/tf_static", frames.learn, kept)
+            node.create_subscription(tf_type, "/tf_static", frames.transforms.add_fixed, kept)
+        if odom_frame:
+            node.create_subscription(tf_type, "/tf", add_moving, QoSProfile(depth=100))
     executor = SingleThreadedExecutor()
     executor.add_node(node)
     threading.Thread(target=_spin, args=(executor, node, into), name="ros", daemon=True).start()
@@ -122,9 +161,13 @@ def _spin(executor: Any, node: Any, into: Newest) -> None:
         node.destroy_node()
 
 
-def stamp_of(message: Any) -> float:
-    """Seconds of a message's header."""
-    return message.header.stamp.sec + message.header.stamp.nanosec / 1e9
+def message_of_tf() -> type | None:
+    """Return the type of the messages on /tf; None without its package, which the wheels of the extra lack."""
+    try:
+        from tf2_msgs.msg import TFMessage
+    except ImportError:
+        return None
+    return TFMessage
 
 
 def image_of(message: Any) -> np.ndarray:
@@ -137,14 +180,42 @@ def image_of(message: Any) -> np.ndarray:
 
 
 def depth_of(message: Any) -> np.ndarray:
-    """Depth in metres, float32 (h, w), 0 = none, of an Image in 16UC1 (millimetres) or 32FC1 (metres)."""
+    """Depth in metres, float32 (h, w), 0 = none, of an Image in 16UC1 (millimetres) or 32FC1 (metres).
+
+    BadFrameError for another encoding. A CompressedImage is one of compressed_depth_image_transport.
+    """
+    if not hasattr(message, "encoding"):
+        return compressed_depth_of(message)
     kinds = {"16UC1": np.uint16, "mono16": np.uint16, "32FC1": np.float32}
     if message.encoding not in kinds:
         raise BadFrameError(f"the topic depth has the encoding {message.encoding!r}, and read are {', '.join(kinds)}")
     dtype = np.dtype(kinds[message.encoding]).newbyteorder(">" if message.is_bigendian else "<")
     rows = np.asarray(message.data, np.uint8).reshape(message.height, message.step)[:, : message.width * dtype.itemsize]
     raw = np.ascontiguousarray(rows).view(dtype).reshape(message.height, message.width)
-    depth = raw.astype(np.float32) * (MILLIMETRE if dtype.kind == "u" else 1.0)
+    return known_depth(raw.astype(np.float32) * (MILLIMETRE if dtype.kind == "u" else 1.0))
+
+
+def compressed_depth_of(message: Any) -> np.ndarray:
+    """Depth in metres, float32 (h, w), 0 = none, of a CompressedImage "16UC1; compressedDepth png", or 32FC1 likewise.
+
+    The latter's PNG holds r = A / depth + B, 0 = none, with A and B in the header.
+    """
+    kind, data = message.format.partition(";")[0].strip(), bytes(message.data)
+    header, png = data[:COMPRESSED_HEADER], data[COMPRESSED_HEADER:]
+    raw = None if damage(png) else cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_UNCHANGED)
+    if kind not in ("16UC1", "32FC1") or raw is None or raw.dtype != np.uint16 or raw.ndim != 2:
+        raise BadFrameError(
+            f"the topic depth has the format {message.format!r}, and read are 16UC1 and 32FC1 as compressedDepth png"
+        )
+    if kind == "16UC1":
+        return raw.astype(np.float32) * np.float32(MILLIMETRE)
+    quantization, offset = np.frombuffer(header, "<f4", 2, offset=4)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return known_depth(np.where(raw > 0, quantization / (raw - offset), 0.0))
+
+
+def known_depth(depth: np.ndarray) -> np.ndarray:
+    """Depth as float32 with 0 where it is not finite and above 0."""
     return np.where(np.isfinite(depth) & (depth > 0), depth, 0.0).astype(np.float32)
 
 
@@ -155,18 +226,15 @@ def pose_of(message: Any) -> np.ndarray:
 
 
 class Frames:
-    """The frames of a robot: what `odometry` moves, and where the camera stands on it."""
+    """The frames of a robot: what `odometry` moves, and where the camera stands on it.
 
-    def __init__(self) -> None:
-        self._parents: dict[str, tuple[str, np.ndarray]] = {}  # of a frame, with T_parent_frame
-        self._camera = ""
+    Args:
+        camera: frame of the images; empty: as their headers say.
+    """
 
-    def learn(self, message: Any) -> None:
-        """Take the transforms of a TFMessage on /tf_static."""
-        for one in message.transforms:
-            place, turn = one.transform.translation, one.transform.rotation
-            pose = rigid((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
-            self._parents[one.child_frame_id.lstrip("/")] = one.header.frame_id.lstrip("/"), pose
+    def __init__(self, camera: str = "") -> None:
+        self.transforms, self.camera = Transforms(), bare(camera)
+        self._is_given = bool(camera)
 
     def read(self, kind: str, message: Any) -> np.ndarray:
         """Read a message of a kind in `READERS`; poses become those of the camera.
@@ -175,31 +243,24 @@ class Frames:
             ValueError: the odometry is of another frame than the images, and none of /tf_static joins the two.
         """
         value = READERS[kind](message)
-        if kind == "image":
-            self._camera = message.header.frame_id.lstrip("/")
-        if kind != "pose" or (self._camera and message.child_frame_id.lstrip("/") == self._camera):
+        if kind == "image" and not self._is_given:
+            self.camera = bare(message.header.frame_id)
+        if kind != "pose" or (self.camera and bare(message.child_frame_id) == self.camera):
             return value
-        if not self._camera:
-            raise ValueError("no image has come whose header names a frame, so what odometry moves is not known")
+        if not self.camera:
+            raise ValueError(
+                "no image has come whose header names a frame, so what odometry moves is not known: give camera_frame:="
+            )
         (camera_root, T_root_camera), (moved_root, T_root_moved) = (
-            self._above(name) for name in (self._camera, message.child_frame_id.lstrip("/"))
+            self.transforms.root(name) for name in (self.camera, bare(message.child_frame_id))
         )
         if camera_root != moved_root:
             raise ValueError(
-                f"odometry is of the frame {message.child_frame_id}, images are of {self._camera}, and /tf_static does "
-                "not join them: take the odometry of the camera, or publish where it is mounted"
+                f"odometry is of the frame {message.child_frame_id}, images are of {self.camera}, and /tf_static does "
+                "not join them: take the odometry of the camera, publish where it is mounted, or take poses from /tf "
+                "(odom_frame:=odom in place of odometry)"
             )
         return value @ np.linalg.inv(T_root_moved) @ T_root_camera
-
-    def _above(self, name: str) -> tuple[str, np.ndarray]:
-        """The last frame above one, and the pose of the latter in it."""
-        pose = np.eye(4)
-        for _ in range(len(self._parents)):
-            if name not in self._parents:
-                break
-            name, step = self._parents[name]
-            pose = step @ pose
-        return name, pose
 
 
 READERS = {"image": image_of, "depth": depth_of, "pose": pose_of}

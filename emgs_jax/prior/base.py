@@ -87,7 +87,11 @@ class Prior(ABC):
         """Predict for `frames`, in the order of `window.views`."""
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
-        """Predict for views of two visits of a place, see `visits`; None if unknown."""
+        """Predict for views of two visits of a place, see `visits`; None if unknown.
+
+        The answer refuses a loop that it does not fit, so it must not follow from the poses of the path between the
+        visits. A prior with one path for all windows has none: the loop that it refuses is the one that corrects it.
+        """
         return self.predict(window, frames, intrinsics)
 
     def num_newer(self, window_size: int) -> int:

@@ -70,8 +70,8 @@ def revisit_note(end: BackEnd | None) -> list[str]:
     """Return a line, with the remedy, if the prior answered none of the queries for loops; otherwise no line."""
     if end is None or set(end.queries.values()) != {SILENT}:
         return []
-    why = f"loops: {len(end.queries)} were measured by keypoints alone, because the prior has no answer for both"
-    return [f"{why}; a recording has them if it is made with `python -m experiments.predict … graph=default`"]
+    why = f"loops: {len(end.queries)} were measured by keypoints alone, because the prior has no answer for both visits"
+    return [f"{why}; a recording of a network has them if it is made with `emgs predict … graph=default`"]
 
 
 def counts(end: BackEnd) -> dict[str, Any]:

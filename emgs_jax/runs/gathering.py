@@ -50,6 +50,11 @@ class Baselines:
         self.poses: list[np.ndarray] = []  # our poses at that time: the finished run has another unit
         self._configs, self._observation, self._dataset = configs, observation, dataset
 
+    @property
+    def has_any(self) -> bool:
+        """Whether there is a baseline."""
+        return bool(self._configs)
+
     def add(self, record: FrameRecord, view: View, points: np.ndarray, mask: np.ndarray, raw_pose: np.ndarray) -> None:
         """Add the frame of a record, with its points (h, w, 3), where they are known, and its raw pose."""
         row = len(self.poses)
@@ -84,6 +89,7 @@ def gather(
     keeps_points: bool,
     baselines: Baselines | None = None,
     text: Text | None = None,
+    has_truth: bool = True,
 ) -> RawPrior:
     """Take all views of a sequence, each in another thread while the next frame is mapped.
 
@@ -91,15 +97,17 @@ def gather(
         frames: records, which baselines need, and views of all frames.
         keeps_points: keep the raw points, because the truth is known or the cloud is made from them.
         text: names and embeddings of the classes for labelling pixels; None: no labels.
+        has_truth: true poses are known, with which the cloud is compared; otherwise it stays empty.
     """
     cloud, kept, classes = SpooledCloud(), Spool(), Spool()
+    needs_cloud = has_truth or (baselines is not None and baselines.has_any)
     labels = None if text is None else SpooledLabels(text[0])
 
     def take(record: FrameRecord | None, view: RawView) -> None:
         points, mask, image, pose, features, _ = view
         known = mask & np.isfinite(points).all(-1)
         depth = np.where(known, points[..., 2], 0.0).astype(np.float32)
-        seen = camera_cloud(points, mask, image, evaluation)
+        seen = camera_cloud(points, mask, image, evaluation) if needs_cloud else PointCloud(*np.zeros((3, 0, 3)))
         if keeps_points:
             kept.append(np.where(known[..., None], points, 0.0).astype(np.float32))
         if text is not None:

@@ -13,10 +13,11 @@ from dataclasses import dataclass, replace
 import numpy as np
 from tqdm import tqdm
 
+from emgs_jax.data.base import Rates
 from emgs_jax.drawing.layers import map_layers
 from emgs_jax.features.text import TextEmbeddings
 from emgs_jax.gaussian_map import GaussianMap
-from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.mapping.records import UNPLACED, FrameRecord
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.base import Prior
@@ -51,10 +52,11 @@ class LiveView:
         self._thread, self._due = ThreadPoolExecutor(1, "live view"), 0.0
         self._drawing, self._has_failed = self._thread.submit(int), False
         self._image: np.ndarray | None = None  # of the last frame
+        self._rates: Rates | None = None
 
-    def show(self, run: MappingRun, image: np.ndarray) -> None:
+    def show(self, run: MappingRun, image: np.ndarray, rates: Rates | None = None) -> None:
         """Show a run with the image of its last frame, if that is due and nothing is being drawn."""
-        self._image = image
+        self._image, self._rates = image, rates
         if time.monotonic() >= self._due and self._drawing.done():
             self._begin(run)
 
@@ -76,9 +78,9 @@ class LiveView:
 
     def _begin(self, run: MappingRun) -> None:
         if run.map is not None and not self._has_failed:
-            self._drawing = self._thread.submit(self._draw, run.map, run.records, self._image)
+            self._drawing = self._thread.submit(self._draw, run.map, run.records, self._image, self._rates)
 
-    def _draw(self, map: GaussianMap, records: Sequence[FrameRecord], image: np.ndarray) -> None:
+    def _draw(self, map: GaussianMap, records: Sequence[FrameRecord], image: np.ndarray, rates: Rates | None) -> None:
         """Draw; on failure, print it once, and the run continues without the live view."""
         begin, step = time.monotonic(), -(-image.shape[1] // IMAGE_WIDTH)
         try:
@@ -89,6 +91,7 @@ class LiveView:
                 poses=np.stack([record.pose for record in records]),
                 truth=np.full((len(records), 3), np.nan),
                 image=with_moving(np.ascontiguousarray(image[::step, ::step]), vars(records[-1])),
+                progress=progress_words(records, rates),
             )
             self.viewer.update(shown)
         except Exception as error:  # whatever it is
@@ -96,6 +99,12 @@ class LiveView:
             tqdm.write(f"the live view stays as it is, and the run goes on: {error!r}")
         end = time.monotonic()
         self._due = end + max(self._every_s, (end - begin) / SHARE)
+
+
+def progress_words(records: Sequence[FrameRecord], rates: Rates | None) -> str:
+    """Say how many frames are mapped and lost and, of a camera, how fast."""
+    lost = sum(record.status in UNPLACED for record in records)
+    return f"{len(records)} frames, {lost} lost" + (f", {rates}" if rates else "")
 
 
 @contextlib.contextmanager

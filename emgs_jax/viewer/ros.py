@@ -7,7 +7,7 @@ the thread of the run, between two frames, so that it never reads a map that is 
 import contextlib
 import time
 from array import array
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import SimpleNamespace
@@ -17,19 +17,23 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 from tqdm import tqdm
 
+from emgs_jax.data.base import Rates
 from emgs_jax.drawing.colors import to_bytes
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.io.npz import read_npz
-from emgs_jax.live.ros import new_node
+from emgs_jax.live.newest import end_all
+from emgs_jax.live.ros import message_of_tf, new_node, parameter
+from emgs_jax.live.transforms import bare
 from emgs_jax.mapping.records import UNPLACED, FrameRecord
 from emgs_jax.mapping.run import MappingRun
 from emgs_jax.ops.ranges import number
-from emgs_jax.runs.files import save_progress
 
-FRAME = "map"
 TF_AHEAD_S = 1.0  # by which map → odom is dated ahead, so that it is there when it is asked for, as AMCL does
 POINT = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("rgb", "<u4")])
 ROW = np.dtype([("point", POINT), ("is_shown", bool)])
+
+
+Save = Callable[[MappingRun, bool], Path]
 
 
 @dataclass(frozen=True)
@@ -39,16 +43,24 @@ class RosConfig:
     every_s: float = number(1.0, low=0.1, high=3600)  # least seconds between two whole maps
 
 
+class NewMapError(Exception):
+    """A new map shall begin: the service `reset` was called."""
+
+
 class RosView:
     """A node that publishes a run; `show` is called after each frame.
 
     Topics: `map` (PointCloud2: all Gaussians; who subscribes later gets the last one), `map_update` (those that the
     last frame changed), `path`, `pose` (Odometry), `diagnostics`, and `map` → the odometry's frame on /tf where the
-    package tf2_msgs is installed. The service `save` (Trigger) writes the map so far into the run's folder.
+    package tf2_msgs is installed and `publish_tf` is not false. The services `save` and `reset` (Trigger) save the run
+    so far; after the latter `show` raises NewMapError.
+
+    Args:
+        save: writes a run and returns its folder; the flag says that this run ends.
     """
 
-    def __init__(self, config: RosConfig, folder: Path, words: Sequence[str], has_saved_map: bool = False) -> None:
-        self._every_s, self._folder = config.every_s, folder
+    def __init__(self, config: RosConfig, words: Sequence[str], save: Save, has_saved_map: bool = False) -> None:
+        self._every_s, self._save_run = config.every_s, save
         self._rclpy, self._node = new_node("emgs_map", words)
         self._types = _types()
         make, kinds = self._node.create_publisher, self._types
@@ -56,24 +68,37 @@ class RosView:
         self._update = make(kinds.PointCloud2, "map_update", 10)
         self._path, self._pose = make(kinds.Path, "path", _latched()), make(kinds.Odometry, "pose", 10)
         self._diagnostics = make(kinds.DiagnosticArray, "diagnostics", 10)
-        self._tf = None if kinds.TFMessage is None else make(kinds.TFMessage, "/tf", 10)
+        self._frame, tf_type = parameter(self._node, "map_frame"), message_of_tf()
+        self._camera_frame = parameter(self._node, "camera_frame") or "camera"
+        publishes_tf = parameter(self._node, "publish_tf") and tf_type is not None
+        self._tf_type, self._tf = tf_type, make(tf_type, "/tf", 10) if publishes_tf else None
         self._node.create_service(kinds.Trigger, "save", self._save)
-        self._odometry_frame: str | None = None
+        self._node.create_service(kinds.Trigger, "reset", self._reset)
+        self._is_reset = False
+        self._odometry_frame: str | None = bare(parameter(self._node, "odom_frame")) or None
         if any(word.startswith("odometry:=") for word in words):
             self._heard = self._node.create_subscription(kinds.Odometry, "odometry", self._learn, _of_sensors())
         self._run: MappingRun | None = None
         self._due, self._shown = 0.0, None
         self._sent: dict[int, tuple[FrameRecord, Any]] = {}  # poses of the path
         self._T_map_world = np.eye(4) if has_saved_map else None
+        self._rates: Rates | None = None
 
-    def show(self, run: MappingRun, image: np.ndarray) -> None:
-        """Publish a run after its last frame, and answer what was asked."""
-        self._run = run
+    def show(self, run: MappingRun, image: np.ndarray, rates: Rates | None = None) -> None:
+        """Publish a run after its last frame, and answer what was asked.
+
+        Raises:
+            NewMapError: a new map shall begin.
+        """
+        self._run, self._rates = run, rates
         if self._T_map_world is None:
             first = odometry_of(run.records[0])
             self._T_map_world = np.eye(4) if first is None else first
         self._publish(run, run.records[-1])
         self._rclpy.spin_once(self._node, timeout_sec=0.0)
+        if self._is_reset:
+            end_all()
+            raise NewMapError
 
     def show_last(self, run: MappingRun) -> None:
         """Publish the finished run, whole."""
@@ -100,13 +125,13 @@ class RosView:
                 self._path.publish(self._types.Path(header=self._header(time_s), poses=self._placed(run)))
                 self._due = time.monotonic() + self._every_s
         if record.status not in UNPLACED:
-            pose = self._types.Odometry(header=self._header(time_s), child_frame_id="camera")
+            pose = self._types.Odometry(header=self._header(time_s), child_frame_id=self._camera_frame)
             pose.pose.pose = self._as_pose(T @ record.pose)
             self._pose.publish(pose)
             odometry = odometry_of(record) if self._tf is not None and self._odometry_frame else None
             if odometry is not None:
                 drift = self._transform(T @ record.pose @ np.linalg.inv(odometry), time_s + TF_AHEAD_S)
-                self._tf.publish(self._types.TFMessage(transforms=[drift]))
+                self._tf.publish(self._tf_type(transforms=[drift]))
         self._diagnostics.publish(self._status(run, record, time_s))
 
     def _status(self, run: MappingRun, record: FrameRecord, time_s: float) -> Any:
@@ -115,6 +140,10 @@ class RosView:
         lost = sum(one.status in UNPLACED for one in run.records)
         values = {"status": record.status, "reason": record.reason or "", "gaussians": record.num_gaussians or 0}
         values |= {"frames": len(run.records), "lost": lost, "seconds": f"{record.seconds:.3f}"}
+        if self._rates is not None:
+            of_camera = self._rates
+            values |= {"maps_per_second": f"{of_camera.maps_per_second:.2f}", "dropped": of_camera.num_dropped}
+            values |= {"behind_seconds": f"{of_camera.behind_s:.3f}"}
         level = kinds.DiagnosticStatus.WARN if record.status in UNPLACED else kinds.DiagnosticStatus.OK
         said = [kinds.KeyValue(key=key, value=str(value)) for key, value in values.items()]
         status = kinds.DiagnosticStatus(level=level, name="emgs", message=record.status, values=said)
@@ -122,17 +151,25 @@ class RosView:
 
     def _save(self, request: Any, response: Any) -> Any:
         """Write what is mapped so far."""
+        return self._answer(response, is_last=False)
+
+    def _reset(self, request: Any, response: Any) -> Any:
+        """Write what is mapped so far, and begin a new map."""
+        response = self._answer(response, is_last=True)
+        self._is_reset = response.success
+        return response
+
+    def _answer(self, response: Any, is_last: bool) -> Any:
         try:
-            if self._run is None or self._run.state is None:
+            if self._run is None:
                 raise ValueError("nothing is mapped yet")
-            save_progress(self._folder, self._run)
-            response.success, response.message = True, f"written to {self._folder}"
+            response.success, response.message = True, f"written to {self._save_run(self._run, is_last)}"
         except (OSError, ValueError) as error:
             response.success, response.message = False, str(error)
         return response
 
     def _header(self, time_s: float) -> Any:
-        header = self._types.Header(frame_id=FRAME)
+        header = self._types.Header(frame_id=self._frame)
         header.stamp.sec, header.stamp.nanosec = int(time_s), round(time_s % 1 * 1e9) % 10**9
         return header
 
@@ -228,7 +265,7 @@ def _latched() -> Any:
 
 
 def _types() -> SimpleNamespace:
-    """The types of messages, once rclpy is there; `TFMessage` is None where tf2_msgs is not installed."""
+    """The types of messages, once rclpy is there."""
     import diagnostic_msgs.msg as diagnostics
     import geometry_msgs.msg as geometry
     import nav_msgs.msg as navigation
@@ -242,21 +279,15 @@ def _types() -> SimpleNamespace:
         **{name: getattr(navigation, name) for name in ("Odometry", "Path")},
         **{name: getattr(sensors, name) for name in ("PointCloud2", "PointField")},
     }
-    try:
-        from tf2_msgs.msg import TFMessage
-    except ImportError:
-        TFMessage = None
-    return SimpleNamespace(**found, Header=standard.Header, Trigger=Trigger, TFMessage=TFMessage)
+    return SimpleNamespace(**found, Header=standard.Header, Trigger=Trigger)
 
 
 @contextlib.contextmanager
-def ros_view(
-    config: RosConfig, folder: Path, words: Sequence[str] = (), has_saved_map: bool = False
-) -> Iterator[RosView]:
+def ros_view(config: RosConfig, words: Sequence[str], save: Save, has_saved_map: bool = False) -> Iterator[RosView]:
     """Publish a run during the block, under the remappings `words`; a saved map is in a frame of its own."""
-    view = RosView(config, folder, words, has_saved_map)
+    view = RosView(config, words, save, has_saved_map)
     try:
-        tqdm.write("the map is published to ROS 2: map, map_update, path, pose, diagnostics; service save")
+        tqdm.write("the map is published to ROS 2: map, map_update, path, pose, diagnostics; services save and reset")
         yield view
     finally:
         view.stop()

@@ -34,6 +34,7 @@ class Shown:
     image: np.ndarray | None = None  # of the last frame, uint8 (h, w, 3); None if unavailable
     splats: Splats | None = None  # of `emgs polish`; None if it was not run
     owners: np.ndarray | None = None  # of `splats`, rows of `layers`
+    progress: str = ""  # of a run that is not finished, in words
 
     @property
     def is_placed(self) -> np.ndarray:

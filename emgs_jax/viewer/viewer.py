@@ -83,6 +83,7 @@ class Viewer:
         self._show()
         self.answer.content = _shown(message)
         self.frame.max = max(len(run.frames) - 1, 1)
+        self.progress.content = _shown(escape(run.progress)) if run.progress else ""
         if self.picture is not None:
             self.picture.image = run.image
         elif run.image is not None:
@@ -104,6 +105,7 @@ class Viewer:
         self.show_paths = gui.add_checkbox("Paths (ours orange, true green)", True)
         self.frame = gui.add_slider("Frame", 0, 1, 1, 0)
         self.go = gui.add_button("Look through its camera")
+        self.progress = gui.add_html("")
         self.facts = gui.add_html(_shown(self._facts(0)))
         self.number = gui.add_html(_shown("Click a Gaussian for its numbers."))
         for control in (self.words, self.against, self.threshold, self.layer):

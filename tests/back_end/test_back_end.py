@@ -3,6 +3,7 @@
 from dataclasses import replace
 from types import SimpleNamespace
 
+import cv2
 import equinox as eqx
 import jax.numpy as jnp
 import jaxlie
@@ -30,7 +31,9 @@ from emgs_jax.back_end.optimization import (
     one_layer_of_state,
 )
 from emgs_jax.back_end.state import BackEnd, Node, add_node, transform_nodes
+from emgs_jax.data.images import Images
 from emgs_jax.device.arrays import to_se3
+from emgs_jax.device.clock import Clock
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.geometry import Sim3, scale_pose
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe
@@ -40,10 +43,12 @@ from emgs_jax.mapping import integrate
 from emgs_jax.mapping.atlas import Atlas, Submap, World
 from emgs_jax.mapping.event import Event
 from emgs_jax.mapping.integrate import finish_back_end, update_graph
-from emgs_jax.mapping.window_input import WindowInput
+from emgs_jax.mapping.window_input import WindowInput, make_prior_query
 from emgs_jax.motion import no_looks
 from emgs_jax.pose_graph.deform import DeformConfig
 from emgs_jax.pose_graph.factors import PoseGraph, residuals
+from emgs_jax.prior.files.prior import Files
+from emgs_jax.prior.files.stream import Stream
 from emgs_jax.registration.pose_estimate import exact_estimate
 from emgs_jax.report.page_words import loop_why
 from emgs_jax.runs import back_end as report
@@ -415,6 +420,27 @@ def test_what_is_known_already_takes_nobodys_turn(graph):
     end = query_prior(end, violated(end, not_in_graph(end, end.verified)), ask)
     assert sorted(a for a, _ in calls) == [5, 6, 7] and end.accepted == []
     assert [one.a for one in violated(end, end.verified)] == [8], "asked for, the prior says what the poses say"
+
+
+@pytest.mark.parametrize("kind", ["files", "stream"])
+def test_loops_that_correct_the_path_of_given_poses_close(graph, kind, tmp_path):
+    """Symptom: prior=files answered with the drifted poses of its own path, and every true loop was refused."""
+    truth, drifted = ring(), ring(1.95 * np.pi)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "files").mkdir()
+    folder = tmp_path / ("files" if kind == "files" else "images")
+    for row, pose in enumerate(drifted):
+        cv2.imwrite(str(tmp_path / "images" / f"{row:02}.png"), np.zeros((48, 64, 3), np.uint8))
+        np.savez(folder / f"{row:02}.npz", depth=np.full((48, 64), 2.0), T_world_camera=pose)
+    images = Images(str(tmp_path / "images"), intrinsics=[60.0, 60.0, 31.5, 23.5], size=(64, 48))
+    keys = {"scale": "metric", "median_depth": 2.0, "depth_scale": 1000.0, "max_depth_step": 0.03, "pose_std": None}
+    prior = Files(folder, **keys, max_misfit=10.0) if kind == "files" else Stream()
+    prior.check(images, WINDOW)
+    ask = make_prior_query(prior, images, graph.prior_query.spacing, WINDOW, Clock())
+    end = replace(with_keyframes(walked(graph, drifted)), verified=[loop(truth, row) for row in range(1, 9)])
+    end = finish_back_end(atlas_of(end, state_of(drifted)), ask).graph
+    assert len(end.accepted) == 8 and not end.refusals
+    assert error(end.poses, truth) < 0.5 * error(drifted, truth)
 
 
 def test_a_loop_of_another_place_is_refused_by_the_prior(graph, drifted):

@@ -101,7 +101,10 @@ def test_what_killed_writes_left_is_removed_and_what_is_being_written_is_not(tmp
     others = [".map.npz", ".tmp", f".map.{dead.pid}.tmpx", "map.npz"]
     for name in (left, running, *others):
         (tmp_path / name).write_text("half")
-    assert remove_temporaries(tmp_path) == [left]
+    images = tmp_path / f".camera.{dead.pid}.tmp.abc"
+    images.mkdir()
+    (images / "0.png").write_text("an image")
+    assert sorted(remove_temporaries(tmp_path)) == sorted([left, images.name])
     assert sorted(path.name for path in tmp_path.iterdir()) == sorted([running, *others])
     with atomic_write(tmp_path / "map.npz") as handle:
         handle.write(b"whole")

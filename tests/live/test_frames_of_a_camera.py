@@ -2,6 +2,7 @@
 
 import threading
 import time
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import cv2
 import numpy as np
@@ -149,6 +150,83 @@ def test_a_camera_without_an_image_is_an_error(source, monkeypatch, given, words
 def test_a_camera_that_is_not_there_names_those_that_are():
     with pytest.raises(ValueError, match=r"camera /dev/nothing cannot be opened: .* \(devices: "):
         Camera(source="/dev/nothing", intrinsics=INTRINSICS)
+
+
+class Device:
+    """A camera of OpenCV's that gives so many images, and then ends or fails."""
+
+    def __init__(self, num_images: int, error: Exception | None = None) -> None:
+        self._left, self._error, self.is_released = num_images, error, False
+
+    def isOpened(self) -> bool:  # noqa: N802 (OpenCV's name)
+        return True
+
+    def set(self, *_) -> None:
+        pass
+
+    def read(self):
+        time.sleep(0.05)
+        self._left -= 1
+        if self._left < 0 and self._error is not None:
+            raise self._error
+        return (True, an_image(self._left)) if self._left >= 0 else (False, None)
+
+    def release(self) -> None:
+        self.is_released = True
+
+
+def test_a_camera_that_another_program_holds_is_named(monkeypatch):
+    """Symptom: V4L2 opens it, and the first image never comes: "camera 0 has ended"."""
+    device = Device(0)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda source: device)
+    with pytest.raises(ValueError, match="camera 0 has failed: it is there and gives no image, as where another"):
+        Camera(source="0", intrinsics=INTRINSICS)
+    until(lambda: device.is_released)
+
+
+@pytest.mark.parametrize(
+    ("error", "words"), [(None, "camera 0 has ended"), (cv2.error("no bandwidth"), "camera 0 has failed: no bandwidth")]
+)
+def test_a_device_that_is_unplugged_is_released_and_its_frames_stay(monkeypatch, error, words):
+    device = Device(3, error)
+    monkeypatch.setattr(cv2, "VideoCapture", lambda source: device)
+    frames = Camera(source="0", intrinsics=INTRINSICS, size=(32, 24))
+    assert 1 <= wait_for_all(frames) <= 3 and words in frames._newest.reason
+    until(lambda: device.is_released)
+    assert frames[0].image.shape == (24, 32, 3)
+
+
+def test_a_camera_of_the_network_that_stalls_gives_no_more_frames(monkeypatch):
+    """A real stream of JPEG images over HTTP, on this machine; its server falls silent after some."""
+    monkeypatch.setattr(camera, "NEXT_S", 1.0)
+    is_over = threading.Event()
+
+    class Stream(BaseHTTPRequestHandler):
+        def do_GET(self) -> None:  # noqa: N802 (the library's name)
+            self.send_response(200)
+            self.send_header("Content-Type", "multipart/x-mixed-replace; boundary=next")
+            self.end_headers()
+            for number in range(40):
+                image = cv2.imencode(".jpg", an_image(5 * number, (64, 48)))[1].tobytes()
+                head = f"--next\r\nContent-Type: image/jpeg\r\nContent-Length: {len(image)}\r\n\r\n"
+                self.wfile.write(head.encode() + image + b"\r\n")
+                time.sleep(0.03)
+            is_over.wait(60)
+
+        def log_message(self, *_) -> None:
+            pass
+
+    with ThreadingHTTPServer(("127.0.0.1", 0), Stream) as server:
+        threading.Thread(target=server.serve_forever, daemon=True).start()
+        try:
+            address = f"http://127.0.0.1:{server.server_port}/stream.mjpg"
+            frames = Camera(source=address, intrinsics=(80.0, 80.0, 31.5, 23.5), size=(64, 48))
+            assert wait_for_all(frames) > 1
+        finally:
+            is_over.set()
+            server.shutdown()
+    assert "has given none for 1 s" in frames._newest.reason
+    assert np.diff([frames[row].image.mean() for row in range(len(frames))]).min() > 0, "in order, none twice"
 
 
 @pytest.mark.parametrize("given", [None, "exif"])

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.live.joined_messages import Joined, pose_at
-from emgs_jax.live.ros import Frames, depth_of, image_of, pose_of, stamp_of
+from emgs_jax.live.ros import Frames, depth_of, image_of, pose_of
+from emgs_jax.live.transforms import Transforms, stamp_of
 
 
 def at(x: float, degrees: float = 0.0) -> np.ndarray:
@@ -154,6 +155,20 @@ def odometry(T: np.ndarray, child: str, time_s: float = 12.25):
     return SimpleNamespace(pose=pose, child_frame_id=child, header=SimpleNamespace(stamp=stamp, frame_id="odom"))
 
 
+def transforms(links, time_s: float = 0.0):
+    """A TFMessage of (parent, child, pose)."""
+    stamp = SimpleNamespace(sec=int(time_s), nanosec=round(time_s % 1 * 1e9))
+    found = [
+        SimpleNamespace(
+            header=SimpleNamespace(frame_id=parent, stamp=stamp),
+            child_frame_id=child,
+            transform=transform(T, place="translation", turn="rotation"),
+        )
+        for parent, child, T in links
+    ]
+    return SimpleNamespace(transforms=found)
+
+
 def random_pose(seed: int) -> np.ndarray:
     pose = np.eye(4)
     pose[:3, :3] = Rotation.random(random_state=seed).as_matrix()
@@ -179,21 +194,66 @@ def test_odometry_of_the_base_becomes_that_of_the_camera_where_tf_says_how_it_is
         frames.read("pose", odometry(T_odom_base, "base_link"))
     np.testing.assert_allclose(frames.read("pose", odometry(T_odom_base, "camera_optical")), T_odom_base, atol=1e-12)
     links = [("base_link", "mast", T_base_mast), ("/mast", "/camera_optical", T_mast_camera)]
-    frames.learn(
-        SimpleNamespace(
-            transforms=[
-                SimpleNamespace(
-                    header=SimpleNamespace(frame_id=parent),
-                    child_frame_id=child,
-                    transform=transform(T, place="translation", turn="rotation"),
-                )
-                for parent, child, T in links
-            ]
-        )
-    )
+    frames.transforms.add_fixed(transforms(links))
     expected = T_odom_base @ T_base_mast @ T_mast_camera
     np.testing.assert_allclose(frames.read("pose", odometry(T_odom_base, "base_link")), expected, atol=1e-12)
     # Of a frame below the base that is no ancestor of the camera.
-    frames._parents["imu"] = "base_link", random_pose(5)
+    frames.transforms.add_fixed(transforms([("base_link", "imu", random_pose(5))]))
     found = frames.read("pose", odometry(T_odom_base @ random_pose(5), "imu"))
     np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+def test_a_moving_camera_on_a_moving_base_is_where_both_are_at_the_time():
+    """A camera on a head that turns: the transforms of both joints come at times of their own."""
+    tree, T_head_camera = Transforms(), random_pose(3)
+    tree.add_fixed(transforms([("head", "camera", T_head_camera)]))
+    assert tree.pose("camera", "odom", 1.0) is None and tree.way("camera", "odom") == []
+    assert tree.add_moving(transforms([("odom", "base", at(1.0))], 1.0), "camera", "odom") == [], "no way yet"
+    heads = [(0.9, at(0.0, 0.0)), (1.3, at(0.0, 40.0))]
+    asked = [tree.add_moving(transforms([("/base", "/head", T)], t), "camera", "odom") for t, T in heads]
+    assert asked == [[0.9], [1.3]] and tree.way("camera", "odom") == ["camera", "head", "base"]
+    assert tree.pose("camera", "odom", 1.1) is None, "where the base is then has not come yet"
+    assert tree.add_moving(transforms([("odom", "base", at(3.0)), ("base", "wheel", at(0))], 1.2), "camera", "odom")
+    np.testing.assert_allclose(tree.pose("camera", "odom", 1.1), at(2.0) @ at(0.0, 20.0) @ T_head_camera, atol=1e-9)
+    assert tree.pose("wheel", "camera", 1.1) is None, "the camera is not above the wheel"
+    np.testing.assert_array_equal(tree.pose("odom", "odom", 1.1), np.eye(4))
+
+
+def test_transforms_do_not_pile_up_begin_anew_and_frames_in_a_circle_lead_nowhere():
+    tree = Transforms()
+    for number in range(1000):
+        tree.add_moving(transforms([("odom", "camera", at(number))], 0.05 * number), "camera", "odom")
+    assert len(tree._moving["camera"][1]) <= 62
+    tree.add_moving(transforms([("odom", "camera", at(7.0))], 0.0), "camera", "odom")  # a bag is played again
+    np.testing.assert_array_equal(tree.pose("camera", "odom", 0.0), at(7.0))
+    tree.add_fixed(transforms([("a", "b", at(0)), ("b", "a", at(0))]))
+    assert tree.pose("a", "odom", 0.0) is None and tree.root("a")[0] in ("a", "b")
+
+
+def test_an_image_takes_its_pose_from_transforms():
+    tree, found = Transforms(), []
+    joined = Joined({"pose"}, {"pose": lambda _, time_s: tree.pose("camera", "odom", time_s)})
+    for number in range(4):
+        found += joined.add("image", 0.25 * number, number)
+        for time_s in tree.add_moving(transforms([("odom", "camera", at(number))], 0.25 * number), "camera", "odom"):
+            found += joined.add("pose", time_s, None)
+    assert [one["image"] for _, one in found] == [0, 1, 2, 3]
+    np.testing.assert_allclose([one["pose"][0, 3] for _, one in found], np.arange(4), atol=1e-6)
+
+
+def test_compressed_depths_are_metres():
+    """As compressed_depth_image_transport writes them; of floats the inverse depth is quantized."""
+    raw, header = np.array([[0, 1500], [65535, 2]], np.uint16), bytes(12)
+    png = header + cv2.imencode(".png", raw)[1].tobytes()
+    found = depth_of(SimpleNamespace(format="16UC1; compressedDepth png", data=png))
+    np.testing.assert_allclose(found, raw / 1000, rtol=1e-6)
+    depth, most, quantization = np.array([[0.5, 2.0], [9.0, np.nan]]), 10.0, 100.0 * 101.0
+    offset = 1.0 - quantization / most
+    codes = np.where(np.isfinite(depth), np.round(quantization / depth + offset), 0).astype(np.uint16)
+    header = np.int32(0).tobytes() + np.float32([quantization, offset]).tobytes()
+    png = header + cv2.imencode(".png", codes)[1].tobytes()
+    found = depth_of(SimpleNamespace(format="32FC1; compressedDepth png", data=png))
+    np.testing.assert_allclose(found, [[0.5, 2.0], [9.0, 0.0]], rtol=0.01)
+    for name, data in (("16UC1; compressedDepth rvl", header + bytes(40)), ("16UC1; compressedDepth png", png[:-5])):
+        with pytest.raises(BadFrameError, match="the topic depth has the format '16UC1; compressedDepth"):
+            depth_of(SimpleNamespace(format=name, data=data))

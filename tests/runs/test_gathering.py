@@ -111,6 +111,16 @@ def test_the_raw_priors_points_are_zero_where_it_says_nothing_and_are_kept_where
     assert len(gather([], evaluation_config(), False).points) == 0
 
 
+def test_without_truth_and_baselines_no_cloud_is_made(monkeypatch):
+    """Symptom: an hour of a camera wrote 60 GB to the disk that nobody read, at a quarter of a step's time."""
+    monkeypatch.setattr("emgs_jax.runs.gathering.camera_cloud", None)
+    view = RawView(np.ones((*SHAPE, 3)), np.ones(SHAPE, bool), Walls()[0].image, np.eye(4), np.zeros((1, 2, 2)))
+    record = FrameRecord(0, "f", 0.0, "tracked", pose=np.eye(4))
+    for baselines in (None, Baselines({}, slam_config().observation, Walls())):
+        found = gather([(record, view)], evaluation_config(), False, baselines, has_truth=False)
+        assert len(found.points) == 0
+
+
 def test_the_classes_of_each_frame_are_kept_and_those_of_its_points_are_where_the_prior_puts_them(gathered):
     _, _, raw = gathered
     found = raw.labels.points(evaluation_config().voxel_m)

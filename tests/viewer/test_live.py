@@ -12,6 +12,7 @@ from test_viewer import free_port
 from tiny_run import compose
 
 from emgs_jax.config.configure import build
+from emgs_jax.data.base import Rates
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.mapping.records import FrameRecord
 from emgs_jax.ops.camera import Camera
@@ -71,6 +72,22 @@ def test_what_is_served_follows_the_run_and_at_its_end_is_the_whole_of_it(at_onc
         np.testing.assert_array_equal(viewer.scene.chosen.position, [2.0 * (NUM_FRAMES - 1), 0, 0])
         assert viewer.scene.paths[0].points.shape == (NUM_FRAMES - 1, 2, 3) and viewer.scene.paths[1] is None
         assert "frame 6: tracked, residual 1.2 % of the depth" in viewer.facts.content, "its number in the data set"
+
+
+def test_how_a_camera_is_mapped_is_shown_beside_the_map(at_once):
+    run = GrowingRun()
+    with served(run, LiveConfig(free_port(), 0.0)) as view:
+        for row, seen in enumerate(run.views()):
+            if row == 1:
+                run.records = (*run.records[:-1], replace(run.records[-1], status="lost"))
+            view.show(run, seen.image, Rates(2.84, 30 * row, 0.41))
+            view.wait()
+            lost = int(row > 0)
+            words = f"{row + 1} frames, {lost} lost, 2.8 maps/s, {30 * row} dropped, 0.4 s behind"
+            assert words in view.viewer.progress.content
+        view.show(run, seen.image)
+        view.wait()
+        assert "dropped" not in view.viewer.progress.content, "where images do not pass"
 
 
 def test_who_looks_at_an_earlier_frame_is_left_there(at_once):

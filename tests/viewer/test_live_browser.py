@@ -1,8 +1,9 @@
 """view=live with a browser that is connected while the run maps; oracles: the run unwatched, the kernel's sockets."""
 
 import io
+import re
 import time
-from itertools import chain
+from itertools import chain, cycle
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +11,12 @@ import pytest
 from browser import MISSING
 from PIL import Image
 from test_viewer import free_port
-from tiny_run import NUM_FRAMES, compose
+from tiny_run import NUM_FRAMES, TINY, compose, dataset
 
 import experiments.run
+from emgs_jax.config import configure
+from emgs_jax.live import capture
+from emgs_jax.live.newest import Shot, end_all
 from emgs_jax.mapping.pipeline import map_frames
 from emgs_jax.viewer import live
 
@@ -94,3 +98,53 @@ def test_a_browser_sees_the_map_grow_and_the_run_has_the_bits_of_one_that_nobody
         asked = {address.split("/")[2] for address in page.requests() if address.startswith(("http", "ws"))}
         assert asked == {f"127.0.0.1:{port}"}
         page.fresh()
+
+
+@pytest.mark.slow
+def test_a_browser_sees_what_a_camera_sees_while_it_runs(tmp_path, monkeypatch, request):
+    """The camera goes to and fro and never ends; the page ends it when it has shown two frames, rates and the map."""
+    pytest.importorskip("viser", reason="the viewer's extra: pip install -e .[viewer]")
+    if MISSING is not None:
+        pytest.skip(MISSING)
+    page, port, shown = request.getfixturevalue("chromium").fresh(), free_port(), []
+
+    def to_and_fro(source, into):
+        frames = [*dataset()]
+        for row, frame in enumerate(cycle([*frames, *frames[-2:0:-1]])):
+            given = {"depth": frame.depth, "T_world_camera": frame.T_world_camera}
+            yield Shot(100.0 + row / 20, frame.image, given)
+            time.sleep(1 / 20)
+
+    def words() -> tuple[int, int, int, int] | None:
+        """Of the panel: the frame, how many are mapped, lost and dropped."""
+        text = page.run("return document.body.innerText")
+        found = re.search(r"(\d+) frames, (\d+) lost, [\d.]+ maps/s, (\d+) dropped, [\d.]+ s behind", text)
+        return None if found is None else (shown_frame(page), *map(int, found.groups()))
+
+    def looked_at(session, *rest):
+        for row, view in enumerate(map_frames(session, *rest)):
+            yield view
+            if row == 2:
+                page.visit(f"http://127.0.0.1:{port}")
+                wait(lambda: share_of_the_map(page) > 0.2, "the page shows no map")
+            if row in (4, 12):
+                wait(
+                    lambda: words() is not None and words()[0] > max((one[0] for one in shown), default=-1), "no rates"
+                )
+                shown.append(words())
+                assert page.run("return [...document.images].some(image => image.naturalWidth === 64)"), "no image"
+            if row == 12:
+                end_all()
+
+    monkeypatch.setattr(capture, "open_source", to_and_fro)
+    monkeypatch.setattr(experiments.run, "map_frames", looked_at)
+    monkeypatch.setattr(live, "SHARE", np.inf)
+    camera = "dataset=camera", "dataset.source=7", "dataset.size=[64,48]", "prior=stream"
+    camera = *camera, "dataset.intrinsics=[{},{},{},{}]".format(*dataset().intrinsics)
+    of_room = [word for word in TINY if not word.startswith("dataset.")]
+    watch = "view=live", f"view.port={port}", "view.every_s=0.1"
+    metrics = experiments.run.run(configure.compose(*of_room, *camera, *watch), tmp_path)
+    (first, count, lost, dropped), (last, later_count, _, later_dropped) = shown
+    assert first < last and count < later_count and lost == 0 and 0 < dropped < later_dropped
+    assert metrics["frames/lost"] == 0 and metrics["camera/num_dropped"] >= later_dropped
+    page.fresh()

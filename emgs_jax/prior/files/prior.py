@@ -167,6 +167,9 @@ class Files(Prior):
         covariance = equal_covariances(std, T_anchor_view)
         return predicted(window, T_anchor_view, [*self._points.values()], pose_covariance=covariance)
 
+    def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
+        """Nothing: every window has the poses of one path, which measure no loop of that path a second time."""
+
     def _pose(self, index: int) -> np.ndarray:
         """T_world_camera of a frame, or NaN."""
         row = self._rows[index]

@@ -45,7 +45,8 @@ class Stream(Prior):
     ) -> None:
         self._max_depth_step, self._max_misfit = float(max_depth_step), float(max_misfit)
         self._pose_std = check_pose_std(pose_std)
-        self._points: dict[int, DenseView] = {}  # of the last window, by frame
+        self._poses: dict[int, np.ndarray] = {}  # of the last window, by frame
+        self._points: dict[int, DenseView] = {}  # likewise
         self._first: list[Sight] | None = []  # views with a pose, until they are compared
         settings = {"scale": "metric", "max_depth_step": self._max_depth_step}
         self.provenance = Provenance("stream", settings | {"pose_std": self._pose_std and [*self._pose_std]})
@@ -69,8 +70,9 @@ class Stream(Prior):
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         size = frames[0].image.shape[1::-1]
         camera, names = Camera((size[0], size[1]), intrinsics), {frame.index: Path(frame.name) for frame in frames}
-        poses = np.concatenate([own_pose(_beside(names[index])) for index in window.views])
-        before, self._points = self._points, {}
+        known, before, self._points = self._poses, self._points, {}
+        self._poses = {i: known[i] if i in known else own_pose(_beside(names[i])) for i in window.views}
+        poses = np.concatenate([*self._poses.values()])
         for index in window.dense:
             is_known = bool(np.isfinite(poses[window.views.index(index)]).all())
             self._points[index] = before.get(index) or self._at_frame(_beside(names[index]), camera, is_known)

@@ -91,8 +91,10 @@ def at_pixels(
     is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
     nearest = np.ix_(row.clip(0, height - 1), column.clip(0, width - 1))
     on = is_inside & mask[nearest]
-    between, is_between = _interpolate(points, mask, columns, rows, max_depth_step)
-    chosen = np.where((on & is_between)[..., None], between, points[nearest])
+    chosen = points[nearest]
+    if (columns % 1).any() or (rows % 1).any():  # at whole pixels nothing lies between
+        between, is_between = _interpolate(points, mask, columns, rows, max_depth_step)
+        chosen = np.where((on & is_between)[..., None], between, chosen)
     return (
         np.where(on[..., None], chosen, 0).astype(np.float32),
         np.where(on, confidence[nearest], 1).astype(np.float32),
