@@ -1,0 +1,420 @@
+"""Structure from motion of images as they come: COLMAP's mapper, called for one keyframe at a time.
+
+A frame that has moved from the last keyframe becomes one: it is matched with the last keyframes and with those that
+look alike, placed by the points that they show, and adjusted with its neighbours. Any other frame is placed by the
+points of its keyframe, and follows it. Before two keyframes have enough parallax, frames wait. Frames that do not fit
+the points are left out. Nothing is asked of images that have not come.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+from jaxtyping import Bool, Float, Float32, Int, UInt8
+
+from emgs_jax.keypoints.poses import essential, pose_of
+from emgs_jax.keypoints.sift import detect, mutual
+from emgs_jax.loop_closure.place_recognition import train_words, vlad
+from emgs_jax.structure.config import StructureConfig
+from emgs_jax.structure.evidence import MIN_MATCHES, NEAR, Evidence, count_own, trust
+from emgs_jax.structure.library import bundle_of, load, options_of
+from emgs_jax.structure.mapping import MIN_IMAGES, WEAK, drop_points_at_cameras
+from emgs_jax.structure.mirror import turned_right
+from emgs_jax.structure.model import NONE, Structure, World
+from emgs_jax.structure.uncertainty import camera_in_world
+
+CAMERA = 1  # COLMAP's number of the camera, and of its rig
+NUM_FEATURES, MIN_CONTRAST, MAX_RATIO = 1500, 0.01, 0.8
+MAX_ERROR = 2.0  # pixels of a match from the epipolar lines, and of a follower's points
+MOVED = 0.04  # median motion of the matches of a keyframe, as a share of the image's width
+FEW = 0.4  # share of the keypoints that match, below which a frame shows something new
+NUM_RECENT, NUM_SIMILAR, NUM_LOST = 4, 2, 8  # keyframes that a new one is matched with, and more if it is not placed
+NUM_WORDS, MAX_TRAINING, NUM_ITERATIONS = 64, 10000, 10  # of place recognition
+ANGLES = 8.0, 4.0, 2.0  # between the views of the first pair [deg], the next after so many keyframes as fit into
+PATIENCE = 10
+MAX_WAITING = 40  # keyframes
+GLOBAL_RATIO = 1.3  # growth after which all is adjusted
+NUM_LOCAL = 24  # keyframes whose landmarks a structure has
+
+
+class View(NamedTuple):
+    """Keypoints of an image."""
+
+    pixels: Float[np.ndarray, "k 2"]  # COLMAP's: from the border
+    descriptors: UInt8[np.ndarray, "k 128"]
+
+
+class Follower(NamedTuple):
+    """A frame that shows what its keyframe shows."""
+
+    keyframe: int
+    rows: Int[np.ndarray, " m"]  # keypoints of the keyframe
+    pixels: Float[np.ndarray, "m 2"]  # of the frame
+    T_keyframe_view: Float[np.ndarray, "4 4"] | None = None  # in the model's unit; None until it is placed
+    points: Sequence[int] = ()  # that it shows
+
+
+@dataclass
+class Online:
+    """The structure of the images so far. Frames are numbered in the order in which they come."""
+
+    start: Any  # pycolmap's camera, as it is known at the beginning
+    config: StructureConfig
+    model: Any = None  # pycolmap's; None before it has begun
+    unit: float = 1.0  # of its lengths
+    views: dict[int, View] = field(default_factory=dict)  # of keyframes
+    images: dict[int, Any] = field(default_factory=dict)  # pycolmap's, likewise
+    pairs: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)  # matches (m, 2) of keyframes
+    E: dict[tuple[int, int], np.ndarray] = field(default_factory=dict)
+    followers: dict[int, Follower] = field(default_factory=dict)
+    words: np.ndarray = field(default_factory=lambda: np.zeros((0, 128), np.float32))
+    vectors: dict[int, np.ndarray] = field(default_factory=dict)
+    num_frames: int = 0
+    num_adjusted: int = 0  # keyframes at the last adjustment of all
+    num_trained: int = 0
+    said: list[str] = field(default_factory=list)
+
+    @property
+    def has_begun(self) -> bool:
+        """True once there is a model."""
+        return self.model is not None
+
+    @property
+    def camera(self) -> Any:
+        """Pycolmap's camera; its distortion is adjusted with the model."""
+        return self.start if self.model is None else self.model.cameras[CAMERA]
+
+    @property
+    def K(self) -> Float[np.ndarray, "3 3"]:
+        """Calibration matrix."""
+        return self.start.calibration_matrix()
+
+    def straight(self, pixels: Float[np.ndarray, "m 2"]) -> Float[np.ndarray, "m 2"]:
+        """Pixels without distortion."""
+        rays = np.asarray(self.camera.cam_from_img(pixels)).reshape(-1, 2)
+        return rays * self.K[[0, 1], [0, 1]] + self.K[:2, 2]
+
+    def placed_frames(self) -> list[int]:
+        """Keyframes with a pose, in order of time."""
+        return [] if self.model is None else sorted(image - 1 for image in self.model.reg_image_ids())
+
+
+def look(image: UInt8[np.ndarray, "h w 3"], mask: Bool[np.ndarray, "h w"] | None = None) -> View:
+    """Find the keypoints of an RGB image; none where the mask is on."""
+    pixels, descriptors = detect(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY), NUM_FEATURES, MIN_CONTRAST)
+    pixels, descriptors = pixels[:NUM_FEATURES], descriptors[:NUM_FEATURES]
+    if mask is not None and len(pixels):
+        column, row = np.clip(np.round(pixels).astype(int), 0, np.array(mask.shape[::-1]) - 1).T
+        pixels, descriptors = pixels[~mask[row, column]], descriptors[~mask[row, column]]
+    return View(pixels + 0.5, np.uint8(np.clip(np.round(512 * descriptors), 0, 255)))
+
+
+def unit_descriptors(view: View) -> Float32[np.ndarray, "k 128"]:
+    """Descriptors of unit length."""
+    found = np.float32(view.descriptors)
+    return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1.0)
+
+
+def match(online: Online, a: View, b: View) -> tuple[Int[np.ndarray, "m 2"], np.ndarray]:
+    """Matches of two views that fit one essential matrix, and it; none where fewer than MIN_MATCHES do."""
+    first, second = mutual(unit_descriptors(a), unit_descriptors(b), MAX_RATIO)
+    if len(first) >= MIN_MATCHES:
+        pixels = online.straight(a.pixels[first]), online.straight(b.pixels[second])
+        E, fits = essential(*pixels, online.K, MAX_ERROR)
+        if E is not None and E.shape == (3, 3) and fits.sum() >= MIN_MATCHES:
+            is_kept = fits.ravel() > 0
+            return np.stack([first[is_kept], second[is_kept]], axis=1), E
+    return np.zeros((0, 2), int), np.zeros((3, 3))
+
+
+def add(online: Online, image: np.ndarray | None, mask: np.ndarray | None = None) -> bool:
+    """Add the next frame, or None for one that cannot be read; True if it has a pose, or waits for one."""
+    number = online.num_frames
+    online.num_frames += 1
+    if image is None:
+        return False
+    view = look(image, mask)
+    if not online.views:
+        keep(online, number, view)
+        return True
+    before = max(online.views)
+    matches, E = match(online, online.views[before], view)
+    if len(matches) and not is_new(online, before, view, matches):
+        online.followers[number] = Follower(before, matches[:, 0], view.pixels[matches[:, 1]])
+        return not online.has_begun or follow(online, number)
+    keep(online, number, view)
+    pair(online, before, number, matches, E)
+    if not online.has_begun:
+        for other in sorted(online.views)[-MAX_WAITING:-2]:
+            pair(online, other, number, *match(online, online.views[other], view))
+        begin(online, number)
+        return True
+    return place(online, number)
+
+
+def is_new(online: Online, before: int, view: View, matches: np.ndarray) -> bool:
+    """Test whether a view shows something that its keyframe does not."""
+    moved = np.linalg.norm(view.pixels[matches[:, 1]] - online.views[before].pixels[matches[:, 0]], axis=1)
+    count = min(len(view.pixels), len(online.views[before].pixels))
+    return bool(np.median(moved) > MOVED * online.start.width or len(matches) < FEW * count)
+
+
+def keep(online: Online, number: int, view: View) -> None:
+    """Keep a view as a keyframe."""
+    pycolmap = load()
+    image = pycolmap.Image(name=str(number), camera_id=CAMERA, image_id=number + 1)
+    image.points2D = pycolmap.Point2DList([pycolmap.Point2D(xy) for xy in view.pixels])
+    image.frame_id = number + 1
+    online.views[number], online.images[number] = view, image
+
+
+def pair(online: Online, a: int, b: int, matches: np.ndarray, E: np.ndarray) -> None:
+    """Keep the matches of two keyframes, if there are any."""
+    if len(matches):
+        online.pairs[a, b], online.E[a, b] = matches, E
+
+
+def mapper_of(online: Online, model: Any, around: Sequence[int] | None = None) -> tuple[Any, Any]:
+    """COLMAP's mapper of a model with the matches of these keyframes, or of all; and what must live as long."""
+    pycolmap = load()
+    cache, sensor, rig = pycolmap.DatabaseCache(), pycolmap.sensor_t(pycolmap.SensorType.CAMERA, CAMERA), pycolmap.Rig()
+    rig.rig_id = CAMERA
+    rig.add_ref_sensor(sensor)
+    cache.add_camera(online.start)
+    cache.add_rig(rig)
+    for number, image in online.images.items():
+        frame = pycolmap.Frame()
+        frame.frame_id, frame.rig_id = number + 1, CAMERA
+        frame.add_data_id(pycolmap.data_t(sensor, number + 1))
+        cache.add_frame(frame)
+        cache.add_image(image)
+    near = None if around is None else {*around}
+    for (a, b), matches in online.pairs.items():
+        if near is None or a in near or b in near:
+            found = pycolmap.TwoViewGeometry()
+            found.config, found.E = pycolmap.TwoViewGeometryConfiguration.CALIBRATED, online.E[a, b]
+            found.inlier_matches = matches
+            cache.correspondence_graph.add_two_view_geometry(a + 1, b + 1, found)
+    cache.correspondence_graph.finalize()
+    mapper = pycolmap.IncrementalMapper(cache)
+    mapper.begin_reconstruction(model)
+    return mapper, cache
+
+
+def settings(online: Online, angle: float = ANGLES[0], is_bent: bool = False) -> tuple[Any, Any, Any]:
+    """COLMAP's options of mapper, adjustment and triangulation; `is_bent`: the distortion is adjusted, too."""
+    common = {"num_threads": online.config.num_threads, "random_seed": online.config.seed}
+    mapper = {
+        "init_min_tri_angle": angle,
+        "init_max_reg_trials": 1000,
+        "max_reg_trials": 1000,
+        "abs_pose_min_num_inliers": online.config.min_inliers,
+        "abs_pose_refine_focal_length": False,
+        "abs_pose_refine_extra_params": False,
+    }
+    is_bent = is_bent and online.config.refine_distortion
+    refined = {"refine_focal_length": False, "refine_extra_params": is_bent, "print_summary": False}
+    adjustment = options_of("BundleAdjustmentOptions", refined)
+    adjustment.ceres.loss_function_type = load().LossFunctionType.SOFT_L1
+    solver = adjustment.ceres.solver_options
+    solver.num_threads, solver.function_tolerance, solver.max_num_iterations = online.config.num_threads, 1e-5, 50
+    triangulation = load().IncrementalTriangulatorOptions(random_seed=online.config.seed)
+    return load().IncrementalMapperOptions(**common, **mapper), adjustment, triangulation
+
+
+def begin(online: Online, newest: int) -> None:
+    """Begin with the first keyframe that has enough parallax to the newest, if the model is one to believe."""
+    waiting = sorted(online.views)[-MAX_WAITING:]
+    angle = ANGLES[min(len(waiting) // PATIENCE, len(ANGLES) - 1)]
+    options, adjustment, triangulation = settings(online, angle)
+    model = load().Reconstruction()
+    mapper, cache = mapper_of(online, model)
+    for other in waiting[:-1]:
+        pose = (other, newest) in online.pairs and mapper.estimate_initial_two_view_geometry(
+            options, other + 1, newest + 1
+        )
+        if not pose:
+            continue
+        mapper.register_initial_image_pair(options, other + 1, newest + 1, pose)
+        for number in (other, newest):
+            mapper.triangulate_image(triangulation, number + 1)
+        if not model.num_points3D():
+            break
+        mapper.adjust_global_bundle(options, adjustment)
+        mapper.filter_points(options)
+        for number in waiting:
+            if not model.images[number + 1].has_pose and mapper.register_next_image(options, number + 1):
+                mapper.triangulate_image(triangulation, number + 1)
+                mapper.iterative_local_refinement(2, 1e-3, options, adjustment, triangulation, number + 1)
+        adjustment = settings(online, is_bent=True)[1]
+        mapper.iterative_global_refinement(3, 1e-3, options, adjustment, triangulation)
+        break
+    mapper.end_reconstruction(False)
+    if model.num_reg_images() >= MIN_IMAGES:
+        adopt(online, model)
+
+
+def adopt(online: Online, model: Any) -> None:
+    """Take a first model, or its mirror image, if it explains the matches; its unit is from its depths."""
+    evidence = evidence_of(online)
+
+    def settle(other: Any) -> None:
+        drop_points_at_cameras(other)
+        problem = bundle_of(other)
+        problem.set_constant_cam_intrinsics(CAMERA)
+        problem.fix_gauge(load().BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+        adjustment = settings(online)[1]
+        load().create_default_ceres_bundle_adjuster(adjustment, problem, other).solve()
+
+    turned = turned_right(model, evidence, settle)
+    if turned.is_doubtful or trust([turned.model], evidence, within=True) < WEAK:
+        return
+    online.model = turned.model
+    depths = np.concatenate([depths_of(online, number) for number in online.placed_frames()])
+    online.unit = online.config.median_depth / float(np.median(depths))
+    online.num_adjusted = model.num_reg_images()
+    learn_words(online)
+    for number in online.followers:
+        follow(online, number)
+
+
+def evidence_of(online: Online) -> Evidence:
+    """The matches of the keyframes, as evidence."""
+    order = {number: row for row, number in enumerate(sorted(online.views))}
+    own = [
+        count_own(
+            np.linalg.inv(online.K).T @ online.E[a, b] @ np.linalg.inv(online.K),
+            online.straight(online.views[a].pixels[matches[:, 0]]),
+            online.straight(online.views[b].pixels[matches[:, 1]]),
+            1.0,
+        )
+        for (a, b), matches in online.pairs.items()
+    ]
+    near = [abs(order[a] - order[b]) <= NEAR for a, b in online.pairs]
+    pairs = [(a + 1, b + 1) for a, b in online.pairs]
+    keypoints = {number + 1: view.pixels for number, view in online.views.items()}
+    return Evidence(pairs, [*online.pairs.values()], np.array(own, int), np.array(near, bool), keypoints, 1.0)
+
+
+def place(online: Online, number: int) -> bool:
+    """Place a new keyframe in the model, and adjust its neighbours; False if it fits nowhere."""
+    placed, view = [one for one in online.placed_frames() if one != number], online.views[number]
+    alike = [one for one in most_alike(online, view) if one in {*placed}]
+    recent = placed[-NUM_RECENT:]
+    others = [one for one in alike if one not in recent]
+    for tried in ([*recent, *others[:NUM_SIMILAR]], others[NUM_SIMILAR : NUM_SIMILAR + NUM_LOST]):
+        for other in tried:
+            if (other, number) not in online.pairs:
+                pair(online, other, number, *match(online, online.views[other], view))
+        if register(online, number):
+            remember(online, number)
+            if online.model.num_reg_images() >= GLOBAL_RATIO * online.num_adjusted:
+                adjust_all(online)
+            return True
+    forget(online, number)
+    return False
+
+
+def register(online: Online, number: int) -> bool:
+    """Place a keyframe by the points that its matches show, triangulate, and adjust the images beside it."""
+    options, adjustment, triangulation = settings(online)
+    beside = [a for a, b in online.pairs if b == number]
+    mapper, cache = mapper_of(online, online.model, [number, *beside])
+    is_placed = mapper.register_next_image(options, number + 1)
+    if is_placed:
+        mapper.triangulate_image(triangulation, number + 1)
+        mapper.iterative_local_refinement(2, 1e-3, options, adjustment, triangulation, number + 1)
+        is_placed = online.model.images[number + 1].has_pose
+    mapper.end_reconstruction(False)
+    return is_placed
+
+
+def adjust_all(online: Online) -> None:
+    """Adjust all keyframes, and find points again."""
+    options, adjustment, triangulation = settings(online, is_bent=True)
+    mapper, cache = mapper_of(online, online.model)
+    mapper.iterative_global_refinement(2, 1e-3, options, adjustment, triangulation, False)
+    mapper.end_reconstruction(False)
+    online.num_adjusted = online.model.num_reg_images()
+
+
+def forget(online: Online, number: int) -> None:
+    """Forget a keyframe that cannot be placed."""
+    for key in [key for key in online.pairs if number in key]:
+        del online.pairs[key], online.E[key]
+    del online.views[number], online.images[number]
+
+
+def learn_words(online: Online) -> None:
+    """Train place recognition on the keyframes, whenever their number has doubled."""
+    descriptors = [unit_descriptors(view) for view in online.views.values()]
+    online.words = train_words(
+        np.concatenate(descriptors), (NUM_WORDS, MAX_TRAINING, NUM_ITERATIONS), online.config.seed
+    )
+    online.vectors = {number: vlad(one, online.words) for number, one in zip(online.views, descriptors, strict=True)}
+    online.num_trained = len(online.views)
+
+
+def remember(online: Online, number: int) -> None:
+    """Add a keyframe to place recognition."""
+    if len(online.views) >= 2 * online.num_trained:
+        learn_words(online)
+    else:
+        online.vectors[number] = vlad(unit_descriptors(online.views[number]), online.words)
+
+
+def most_alike(online: Online, view: View) -> list[int]:
+    """Keyframes, the most similar first."""
+    if not online.vectors:
+        return []
+    numbers, vectors = [*online.vectors], np.stack([*online.vectors.values()])
+    return [numbers[row] for row in np.argsort(-(vectors @ vlad(unit_descriptors(view), online.words)), kind="stable")]
+
+
+def shown_by(online: Online, number: int) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
+    """Keypoints of a placed keyframe that show points, and the numbers of these."""
+    image = online.model.images[number + 1]
+    rows = np.array(image.get_observation_point2D_idxs(), int)
+    return rows, np.array([point.point3D_id for point in image.get_observation_points2D()], int)
+
+
+def positions(online: Online, points: Sequence[int]) -> Float[np.ndarray, "p 3"]:
+    """Points of the model, in its unit."""
+    known = online.model.points3D
+    return np.array([known[int(point)].xyz for point in points]).reshape(-1, 3)
+
+
+def depths_of(online: Online, number: int) -> Float[np.ndarray, " p"]:
+    """Depths of the points that a keyframe shows, in the model's unit."""
+    T = np.linalg.inv(camera_in_world(online.model.images[number + 1]))
+    return positions(online, shown_by(online, number)[1]) @ T[2, :3] + T[2, 3]
+
+
+def follow(online: Online, number: int) -> bool:
+    """Place a frame by the points of its keyframe."""
+    one = online.followers[number]
+    if one.keyframe not in online.views or not online.model.images[one.keyframe + 1].has_pose:
+        return False
+    rows, points = shown_by(online, one.keyframe)
+    place = {row: point for row, point in zip(rows.tolist(), points.tolist(), strict=True)}
+    is_known = np.array([row in place for row in one.rows.tolist()], bool)
+    seen = np.array([place[row] for row in one.rows[is_known].tolist()], int)
+    pixels = online.straight(one.pixels[is_known])
+    found = pose_of(positions(online, seen), pixels, online.K, online.config.min_inliers, MAX_ERROR)
+    if found is None:
+        return False
+    T_world_view, kept = found
+    T_keyframe_view = np.linalg.inv(camera_in_world(online.model.images[one.keyframe + 1])) @ T_world_view
+    online.followers[number] = one._replace(T_keyframe_view=T_keyframe_view, points=seen[kept])
+    return True
+
+
+def poses_of(online: Online) -> dict[int, Float[np.ndarray, "4 4"]]:
+    """T_world_camera of the frames that have one, in the model's unit."""
+    found = {number: camera_in_world(online.model.images[number + 1]) for number in online.placed_frames()}
+    for number, one in online.followers.items():
+        if one.T_keyframe_view is not None and one.keyframe in found:
+            found[number] = found[one.keyframe] @ one.T_keyframe_view
+    return dict(sorted(found.items()))
