@@ -6,7 +6,7 @@ points of its keyframe, and follows it. Before two keyframes have enough paralla
 the points are left out. Nothing is asked of images that have not come.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -22,7 +22,7 @@ from emgs_jax.structure.evidence import MIN_MATCHES, NEAR, Evidence, count_own, 
 from emgs_jax.structure.library import bundle_of, load, options_of
 from emgs_jax.structure.mapping import MIN_IMAGES, WEAK, drop_points_at_cameras
 from emgs_jax.structure.mirror import turned_right
-from emgs_jax.structure.model import NONE, Structure, World
+from emgs_jax.structure.model import NONE, Structure, World, scaled
 from emgs_jax.structure.uncertainty import camera_in_world
 
 CAMERA = 1  # COLMAP's number of the camera, and of its rig
@@ -36,7 +36,7 @@ ANGLES = 8.0, 4.0, 2.0  # between the views of the first pair [deg], the next af
 PATIENCE = 10
 MAX_WAITING = 40  # keyframes
 GLOBAL_RATIO = 1.3  # growth after which all is adjusted
-NUM_LOCAL = 24  # keyframes whose landmarks a structure has
+NUM_LOCAL = 24  # keyframes that tell how sure a point is
 
 
 class View(NamedTuple):
@@ -53,7 +53,7 @@ class Follower(NamedTuple):
     rows: Int[np.ndarray, " m"]  # keypoints of the keyframe
     pixels: Float[np.ndarray, "m 2"]  # of the frame
     T_keyframe_view: Float[np.ndarray, "4 4"] | None = None  # in the model's unit; None until it is placed
-    points: Sequence[int] = ()  # that it shows
+    points: Int[np.ndarray, " p"] = np.zeros(0, int)  # that it shows
 
 
 @dataclass
@@ -71,10 +71,12 @@ class Online:
     followers: dict[int, Follower] = field(default_factory=dict)
     words: np.ndarray = field(default_factory=lambda: np.zeros((0, 128), np.float32))
     vectors: dict[int, np.ndarray] = field(default_factory=dict)
+    points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # by COLMAP's number, NaN for those that went
+    shown: dict[int, np.ndarray] = field(default_factory=dict)  # numbers of the points that each keyframe shows
+    covariance: dict[int, np.ndarray] = field(default_factory=dict)  # (6, 6) of a frame's pose when it was placed
     num_frames: int = 0
     num_adjusted: int = 0  # keyframes at the last adjustment of all
     num_trained: int = 0
-    said: list[str] = field(default_factory=list)
 
     @property
     def has_begun(self) -> bool:
@@ -217,7 +219,7 @@ def settings(online: Online, angle: float = ANGLES[0], is_bent: bool = False) ->
     is_bent = is_bent and online.config.refine_distortion
     refined = {"refine_focal_length": False, "refine_extra_params": is_bent, "print_summary": False}
     adjustment = options_of("BundleAdjustmentOptions", refined)
-    adjustment.ceres.loss_function_type = load().LossFunctionType.SOFT_L1
+    adjustment.ceres.loss_function_type = load().LossFunctionType.CAUCHY
     solver = adjustment.ceres.solver_options
     solver.num_threads, solver.function_tolerance, solver.max_num_iterations = online.config.num_threads, 1e-5, 50
     triangulation = load().IncrementalTriangulatorOptions(random_seed=online.config.seed)
@@ -272,10 +274,13 @@ def adopt(online: Online, model: Any) -> None:
     if turned.is_doubtful or trust([turned.model], evidence, within=True) < WEAK:
         return
     online.model = turned.model
+    refresh(online, online.placed_frames())
     depths = np.concatenate([depths_of(online, number) for number in online.placed_frames()])
     online.unit = online.config.median_depth / float(np.median(depths))
     online.num_adjusted = model.num_reg_images()
     learn_words(online)
+    for number in online.placed_frames():
+        measure(online, number)
     for number in online.followers:
         follow(online, number)
 
@@ -309,6 +314,7 @@ def place(online: Online, number: int) -> bool:
             if (other, number) not in online.pairs:
                 pair(online, other, number, *match(online, online.views[other], view))
         if register(online, number):
+            measure(online, number)
             remember(online, number)
             if online.model.num_reg_images() >= GLOBAL_RATIO * online.num_adjusted:
                 adjust_all(online)
@@ -327,7 +333,10 @@ def register(online: Online, number: int) -> bool:
         mapper.triangulate_image(triangulation, number + 1)
         mapper.iterative_local_refinement(2, 1e-3, options, adjustment, triangulation, number + 1)
         is_placed = online.model.images[number + 1].has_pose
+        adjusted = {*beside, *(image - 1 for image in mapper.find_local_bundle(options, number + 1))}
     mapper.end_reconstruction(False)
+    if is_placed:
+        refresh(online, [number, *(one for one in adjusted if online.model.images[one + 1].has_pose)])
     return is_placed
 
 
@@ -338,6 +347,7 @@ def adjust_all(online: Online) -> None:
     mapper.iterative_global_refinement(2, 1e-3, options, adjustment, triangulation, False)
     mapper.end_reconstruction(False)
     online.num_adjusted = online.model.num_reg_images()
+    refresh(online, online.placed_frames())
 
 
 def forget(online: Online, number: int) -> None:
@@ -373,48 +383,105 @@ def most_alike(online: Online, view: View) -> list[int]:
     return [numbers[row] for row in np.argsort(-(vectors @ vlad(unit_descriptors(view), online.words)), kind="stable")]
 
 
-def shown_by(online: Online, number: int) -> tuple[Int[np.ndarray, " p"], Int[np.ndarray, " p"]]:
-    """Keypoints of a placed keyframe that show points, and the numbers of these."""
-    image = online.model.images[number + 1]
-    rows = np.array(image.get_observation_point2D_idxs(), int)
-    return rows, np.array([point.point3D_id for point in image.get_observation_points2D()], int)
-
-
-def positions(online: Online, points: Sequence[int]) -> Float[np.ndarray, "p 3"]:
-    """Points of the model, in its unit."""
+def refresh(online: Online, keyframes: Sequence[int]) -> None:
+    """Read the points again that these keyframes show or have shown."""
+    for number in keyframes:
+        online.points[online.shown.get(number, [])] = np.nan
+    for number in keyframes:
+        observed = online.model.images[number + 1].get_observation_points2D()
+        online.shown[number] = np.array([one.point3D_id for one in observed], int)
+    seen = np.unique(np.concatenate([online.shown[number] for number in keyframes]))
+    if missing := int(seen.max(initial=-1)) + 1 - len(online.points):
+        more = np.full((max(missing, len(online.points), 0), 3), np.nan)
+        online.points = np.concatenate([online.points, more]) if missing > 0 else online.points
     known = online.model.points3D
-    return np.array([known[int(point)].xyz for point in points]).reshape(-1, 3)
+    online.points[seen] = np.array([known[int(point)].xyz for point in seen]).reshape(-1, 3)
+
+
+def shown_by(online: Online, number: int) -> Int[np.ndarray, " p"]:
+    """Numbers of the points that a frame shows and that are still there."""
+    points = online.shown[number] if number in online.shown else online.followers[number].points
+    return points[np.isfinite(online.points[points, 0])]
 
 
 def depths_of(online: Online, number: int) -> Float[np.ndarray, " p"]:
     """Depths of the points that a keyframe shows, in the model's unit."""
-    T = np.linalg.inv(camera_in_world(online.model.images[number + 1]))
-    return positions(online, shown_by(online, number)[1]) @ T[2, :3] + T[2, 3]
+    T = pose_at(online, number)
+    return (online.points[shown_by(online, number)] - T[:3, 3]) @ T[:3, 2]
 
 
 def follow(online: Online, number: int) -> bool:
     """Place a frame by the points of its keyframe."""
     one = online.followers[number]
-    if one.keyframe not in online.views or not online.model.images[one.keyframe + 1].has_pose:
+    if pose_at(online, one.keyframe) is None:
         return False
-    rows, points = shown_by(online, one.keyframe)
-    place = {row: point for row, point in zip(rows.tolist(), points.tolist(), strict=True)}
-    is_known = np.array([row in place for row in one.rows.tolist()], bool)
-    seen = np.array([place[row] for row in one.rows[is_known].tolist()], int)
-    pixels = online.straight(one.pixels[is_known])
-    found = pose_of(positions(online, seen), pixels, online.K, online.config.min_inliers, MAX_ERROR)
+    image = online.model.images[one.keyframe + 1]
+    point = np.full(len(online.views[one.keyframe].pixels), -1)
+    point[image.get_observation_point2D_idxs()] = online.shown[one.keyframe]
+    seen, pixels = point[one.rows], online.straight(one.pixels)
+    is_known = (seen >= 0) & np.isfinite(online.points[seen, 0])
+    seen, pixels = seen[is_known], pixels[is_known]
+    found = pose_of(online.points[seen], pixels, online.K, online.config.min_inliers, MAX_ERROR)
     if found is None:
         return False
     T_world_view, kept = found
-    T_keyframe_view = np.linalg.inv(camera_in_world(online.model.images[one.keyframe + 1])) @ T_world_view
+    T_keyframe_view = np.linalg.inv(pose_at(online, one.keyframe)) @ T_world_view
     online.followers[number] = one._replace(T_keyframe_view=T_keyframe_view, points=seen[kept])
+    measure(online, number)
     return True
 
 
-def poses_of(online: Online) -> dict[int, Float[np.ndarray, "4 4"]]:
-    """T_world_camera of the frames that have one, in the model's unit."""
-    found = {number: camera_in_world(online.model.images[number + 1]) for number in online.placed_frames()}
-    for number, one in online.followers.items():
-        if one.T_keyframe_view is not None and one.keyframe in found:
-            found[number] = found[one.keyframe] @ one.T_keyframe_view
-    return dict(sorted(found.items()))
+def pose_at(online: Online, number: int) -> Float[np.ndarray, "4 4"] | None:
+    """T_world_camera of a frame in the model's unit; None without one."""
+    one = online.followers.get(number)
+    keyframe = number if one is None else one.keyframe
+    if not online.has_begun or keyframe not in online.views or (one is not None and one.T_keyframe_view is None):
+        return None
+    image = online.model.images[keyframe + 1] if online.model.exists_image(keyframe + 1) else None
+    if image is None or not image.has_pose:
+        return None
+    return camera_in_world(image) if one is None else camera_in_world(image) @ one.T_keyframe_view
+
+
+def measure(online: Online, number: int) -> None:
+    """Estimate the covariance of a frame's pose, see `Structure`, from its points and theirs from earlier keyframes."""
+    T, points = pose_at(online, number), shown_by(online, number)
+    before = [one for one in online.placed_frames() if one < number][-NUM_LOCAL:]
+    others = before or [one for one in online.placed_frames() if one != number][:NUM_LOCAL]
+    information = np.zeros((len(points), 3, 3))
+    focal = online.start.mean_focal_length()
+    for other in others:
+        ray = online.points[points] - pose_at(online, other)[:3, 3]
+        across = (ray**2).sum(1)[:, None, None] * np.eye(3) - ray[:, :, None] * ray[:, None, :]
+        is_shown = np.isin(points, online.shown[other])
+        information += is_shown[:, None, None] * across * focal**2 / ((ray**2).sum(1) ** 2)[:, None, None]
+    is_sure = np.linalg.det(information) > 0
+    spread = np.linalg.inv(np.where(is_sure[:, None, None], information, np.eye(3)))
+    local = (online.points[points] - T[:3, 3]) @ T[:3, :3]
+    z, x = local[:, 2], local[:, :2] / local[:, 2:]
+    onto = np.zeros((len(points), 2, 3))  # of pixels, by the point in the camera's axes
+    onto[:, 0, 0] = onto[:, 1, 1] = focal / z
+    onto[:, :, 2] = -focal * x / z[:, None]
+    cross = np.zeros((len(points), 3, 3))
+    cross[:, [2, 0, 1], [1, 2, 0]], cross[:, [1, 2, 0], [2, 0, 1]] = local, -local
+    by_pose = onto @ np.concatenate([-np.broadcast_to(np.eye(3), cross.shape), cross], axis=2)
+    by_point = onto @ T[:3, :3].T
+    noise = np.eye(2) + by_point @ spread @ by_point.mT
+    known = (by_pose.mT @ np.linalg.solve(noise, by_pose))[is_sure & (z > 0)].sum(axis=0)
+    if np.linalg.matrix_rank(known) == 6:
+        online.covariance[number] = online.config.pixel_std**2 * np.linalg.inv(known)
+
+
+def newest(online: Online) -> Structure:
+    """The structure of the frames so far, one world."""
+    count = online.num_frames
+    world, T, covariance = np.full(count, NONE), np.full((count, 4, 4), np.nan), np.full((count, 6, 6), np.nan)
+    landmarks = [np.zeros(0, int)] * count
+    for number in range(count):
+        if (pose := pose_at(online, number)) is None:
+            continue
+        world[number], T[number] = 0, pose
+        covariance[number] = online.covariance.get(number, np.nan)
+        landmarks[number] = shown_by(online, number)
+    structure = Structure([World(online.points, online.camera)], world, T, covariance, landmarks)
+    return scaled(structure, [online.unit])
