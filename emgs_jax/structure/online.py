@@ -6,6 +6,7 @@ points of its keyframe, and follows it. Before two keyframes have enough paralla
 the points are left out. Nothing is asked of images that have not come.
 """
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from typing import Any, NamedTuple
 import cv2
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Int, UInt8
+from scipy.spatial import cKDTree
 
 from emgs_jax.keypoints.poses import essential, pose_of
 from emgs_jax.keypoints.sift import detect, mutual
@@ -30,12 +32,16 @@ NUM_FEATURES, MIN_CONTRAST, MAX_RATIO = 1500, 0.01, 0.8
 MAX_ERROR = 2.0  # pixels of a match from the epipolar lines, and of a follower's points
 MOVED = 0.04  # median motion of the matches of a keyframe, as a share of the image's width
 FEW = 0.4  # share of the keypoints that match, below which a frame shows something new
-NUM_RECENT, NUM_SIMILAR, NUM_LOST = 4, 2, 8  # keyframes that a new one is matched with, and more if it is not placed
+# Keyframes that a new one is matched with: the last, those most alike, more if it is not placed; and those whose points
+# are looked for in it once it is placed.
+NUM_RECENT, NUM_SIMILAR, NUM_LOST, NUM_TIED = 3, 2, 8, 12
+NUM_NEAR, MIN_LIKENESS = 4, 0.8  # keypoints that are compared there, and the least cosine of their descriptors
+RADIUS = 8.0  # pixels around a point's place in which its keypoint is looked for
 NUM_WORDS, MAX_TRAINING, NUM_ITERATIONS = 64, 10000, 10  # of place recognition
 ANGLES = 8.0, 4.0, 2.0  # between the views of the first pair [deg], the next after so many keyframes as fit into
 PATIENCE = 10
 MAX_WAITING = 40  # keyframes
-GLOBAL_RATIO = 1.3  # growth after which all is adjusted
+GLOBAL_RATIO = 1.2  # growth after which all is adjusted
 NUM_LOCAL = 24  # keyframes that tell how sure a point is
 
 
@@ -326,18 +332,48 @@ def place(online: Online, number: int) -> bool:
 def register(online: Online, number: int) -> bool:
     """Place a keyframe by the points that its matches show, triangulate, and adjust the images beside it."""
     options, adjustment, triangulation = settings(online)
+    mapper, cache = mapper_of(online, online.model, [number])
+    is_placed = mapper.register_next_image(options, number + 1)
+    mapper.end_reconstruction(False)
+    if not is_placed:
+        return False
+    tie(online, number)
     beside = [a for a, b in online.pairs if b == number]
     mapper, cache = mapper_of(online, online.model, [number, *beside])
-    is_placed = mapper.register_next_image(options, number + 1)
-    if is_placed:
-        mapper.triangulate_image(triangulation, number + 1)
-        mapper.iterative_local_refinement(2, 1e-3, options, adjustment, triangulation, number + 1)
-        is_placed = online.model.images[number + 1].has_pose
-        adjusted = {*beside, *(image - 1 for image in mapper.find_local_bundle(options, number + 1))}
+    mapper.triangulate_image(triangulation, number + 1)
+    mapper.iterative_local_refinement(2, 1e-3, options, adjustment, triangulation, number + 1)
+    is_placed = online.model.images[number + 1].has_pose
+    adjusted = {number, *beside, *(image - 1 for image in mapper.find_local_bundle(options, number + 1))}
     mapper.end_reconstruction(False)
-    if is_placed:
-        refresh(online, [number, *(one for one in adjusted if online.model.images[one + 1].has_pose)])
+    refresh(online, [one for one in sorted(adjusted) if online.model.images[one + 1].has_pose])
     return is_placed
+
+
+def tie(online: Online, number: int) -> None:
+    """Match a placed keyframe with more of those alike, by where their points lie in it: cheaper than all with all."""
+    view = online.views[number]
+    T = np.linalg.inv(pose_at(online, number))
+    pixels, descriptors = cKDTree(view.pixels), unit_descriptors(view)
+    others = [one for one in most_alike(online, view)[:NUM_TIED] if (one, number) not in online.pairs]
+    for other in (one for one in others if pose_at(online, one) is not None):
+        points, rows = online.shown[other], online.model.images[other + 1].get_observation_point2D_idxs()
+        local = online.points[points] @ T[:3, :3].T + T[:3, 3]
+        is_before = np.isfinite(local[:, 2]) & (local[:, 2] > 0)
+        rows, local = np.array(rows, int)[is_before], local[is_before]
+        if len(rows) < MIN_MATCHES:
+            continue
+        places = np.asarray(online.camera.img_from_cam(local))
+        distance, near = pixels.query(places, k=NUM_NEAR, distance_upper_bound=RADIUS)
+        likeness = np.einsum(
+            "pd,pkd->pk", unit_descriptors(online.views[other])[rows], descriptors[near % len(view.pixels)]
+        )
+        likeness[~np.isfinite(distance)] = -1.0
+        best = likeness.argmax(axis=1)
+        is_like = likeness.max(axis=1) > MIN_LIKENESS
+        matches = np.stack([rows[is_like], near[np.arange(len(rows)), best][is_like]], axis=1)
+        matches = matches[np.unique(matches[:, 1], return_index=True)[1]]
+        if len(matches) >= MIN_MATCHES:
+            pair(online, other, number, matches, np.zeros((3, 3)))
 
 
 def adjust_all(online: Online) -> None:
@@ -483,5 +519,6 @@ def newest(online: Online) -> Structure:
         world[number], T[number] = 0, pose
         covariance[number] = online.covariance.get(number, np.nan)
         landmarks[number] = shown_by(online, number)
-    structure = Structure([World(online.points, online.camera)], world, T, covariance, landmarks)
+    camera = copy.copy(online.camera)
+    structure = Structure([World(online.points, camera)], world, T, covariance, landmarks, online.num_adjusted)
     return scaled(structure, [online.unit])

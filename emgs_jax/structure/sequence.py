@@ -46,6 +46,7 @@ def follow_images(dataset: Dataset, config: StructureConfig) -> Callable[[int], 
     read, size, intrinsics = full_images(dataset)
     model, parameters = pinhole_of(intrinsics, config)
     camera = load().Camera(model=model, width=size[0], height=size[1], params=parameters, camera_id=CAMERA)
+    camera.has_prior_focal_length = True
     mask = getattr(dataset, "full_mask", None) or (lambda index: None)
     online, known = Online(camera, config), {}
 

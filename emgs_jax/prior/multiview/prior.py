@@ -10,7 +10,7 @@ prediction has the poses of the current frame's world. A frame that no model hol
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -83,6 +83,7 @@ class MultiviewStereo(Prior):
         self._up_to: Callable[[int], Structure] | None = None  # of the frames up to this one, at least
         self._known: Structure | None = None
         self._lenses: dict[tuple, Lens] = {}
+        self._num_adjusted = 0
 
     def num_newer(self, window_size: int) -> int:
         """All but one: a structure knows all images, so the first frame alone begins the map. None online."""
@@ -118,6 +119,9 @@ class MultiviewStereo(Prior):
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict; a view that is in no model has NaN and no valid point."""
         structure = self._take(max(window.views))
+        return replace(self._predicted(structure, window), adjusted=self._adjusted(structure, window.current))
+
+    def _predicted(self, structure: Structure, window: Window) -> PriorPrediction:
         world = self._world_at(window.current)
         T, spread = np.full((len(window.views), 4, 4), np.nan), np.full((len(window.views), 6, 6), np.nan)
         anchor = window.views[0]
@@ -131,11 +135,20 @@ class MultiviewStereo(Prior):
         scale_std = np.float64(self._depths(current).scale_std) if structure.is_placed[current] else None
         return predicted(window, T, dense, pose_covariance=spread, scale_std=scale_std, world=world)
 
+    def _adjusted(self, structure: Structure, current: int) -> dict[int, np.ndarray]:
+        """The poses of earlier frames, relative to the first, where all were adjusted since the last call."""
+        was, self._num_adjusted = self._num_adjusted, structure.num_adjusted
+        if was == structure.num_adjusted or structure.world[0] == NONE:
+            return {}
+        T = np.linalg.inv(structure.T_world_camera[0]) @ structure.T_world_camera
+        return {frame: T[frame] for frame in range(current) if structure.is_placed[frame]}
+
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
         """Predict for views of two visits of a place; None unless they are in one world."""
-        world = self._take(max(window.views)).world[[window.views[0], window.current]]
+        structure = self._take(max(window.views))
+        world = structure.world[[window.views[0], window.current]]
         is_known = world[0] == world[1] != NONE
-        return self.predict(window, frames, intrinsics) if is_known else None
+        return self._predicted(structure, window) if is_known else None
 
     def _take(self, frame: int) -> Structure:
         """The structure of the images up to this one, or of more."""
