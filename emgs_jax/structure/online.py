@@ -79,6 +79,7 @@ class Online:
     vectors: dict[int, np.ndarray] = field(default_factory=dict)
     points: np.ndarray = field(default_factory=lambda: np.zeros((0, 3)))  # by COLMAP's number, NaN for those that went
     shown: dict[int, np.ndarray] = field(default_factory=dict)  # numbers of the points that each keyframe shows
+    rows: dict[int, np.ndarray] = field(default_factory=dict)  # and its keypoints that show them
     covariance: dict[int, np.ndarray] = field(default_factory=dict)  # (6, 6) of a frame's pose when it was placed
     num_frames: int = 0
     num_adjusted: int = 0  # keyframes at the last adjustment of all
@@ -356,10 +357,10 @@ def tie(online: Online, number: int) -> None:
     pixels, descriptors = cKDTree(view.pixels), unit_descriptors(view)
     others = [one for one in most_alike(online, view)[:NUM_TIED] if (one, number) not in online.pairs]
     for other in (one for one in others if pose_at(online, one) is not None):
-        points, rows = online.shown[other], online.model.images[other + 1].get_observation_point2D_idxs()
+        points, rows = online.shown[other], online.rows[other]
         local = online.points[points] @ T[:3, :3].T + T[:3, 3]
         is_before = np.isfinite(local[:, 2]) & (local[:, 2] > 0)
-        rows, local = np.array(rows, int)[is_before], local[is_before]
+        rows, local = rows[is_before], local[is_before]
         if len(rows) < MIN_MATCHES:
             continue
         places = np.asarray(online.camera.img_from_cam(local))
@@ -424,8 +425,9 @@ def refresh(online: Online, keyframes: Sequence[int]) -> None:
     for number in keyframes:
         online.points[online.shown.get(number, [])] = np.nan
     for number in keyframes:
-        observed = online.model.images[number + 1].get_observation_points2D()
-        online.shown[number] = np.array([one.point3D_id for one in observed], int)
+        image = online.model.images[number + 1]
+        online.rows[number] = np.array(image.get_observation_point2D_idxs(), int)
+        online.shown[number] = np.array([one.point3D_id for one in image.get_observation_points2D()], int)
     seen = np.unique(np.concatenate([online.shown[number] for number in keyframes]))
     if missing := int(seen.max(initial=-1)) + 1 - len(online.points):
         more = np.full((max(missing, len(online.points), 0), 3), np.nan)
@@ -451,9 +453,8 @@ def follow(online: Online, number: int) -> bool:
     one = online.followers[number]
     if pose_at(online, one.keyframe) is None:
         return False
-    image = online.model.images[one.keyframe + 1]
     point = np.full(len(online.views[one.keyframe].pixels), -1)
-    point[image.get_observation_point2D_idxs()] = online.shown[one.keyframe]
+    point[online.rows[one.keyframe]] = online.shown[one.keyframe]
     seen, pixels = point[one.rows], online.straight(one.pixels)
     is_known = (seen >= 0) & np.isfinite(online.points[seen, 0])
     seen, pixels = seen[is_known], pixels[is_known]

@@ -8,7 +8,6 @@ from stereo_scene import similarity_error, structure_config
 
 from emgs_jax.data.base import Frame
 from emgs_jax.data.synthetic import Synthetic
-from emgs_jax.structure.model import NONE
 from emgs_jax.structure.sequence import follow_images
 
 pytestmark = pytest.mark.slow
