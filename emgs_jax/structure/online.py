@@ -481,13 +481,12 @@ def pose_at(online: Online, number: int) -> Float[np.ndarray, "4 4"] | None:
 
 
 def measure(online: Online, number: int) -> None:
-    """Estimate the covariance of a frame's pose, see `Structure`, from its points and theirs from earlier keyframes."""
+    """Estimate the covariance of a frame's pose, see `Structure`, from its points and theirs from the other keyframes."""
     T, points = pose_at(online, number), shown_by(online, number)
-    before = [one for one in online.placed_frames() if one < number][-NUM_LOCAL:]
-    others = before or [one for one in online.placed_frames() if one != number][:NUM_LOCAL]
+    others = sorted((abs(one - number), one) for one in online.placed_frames() if one != number)[:NUM_LOCAL]
     information = np.zeros((len(points), 3, 3))
     focal = online.start.mean_focal_length()
-    for other in others:
+    for _, other in others:
         ray = online.points[points] - pose_at(online, other)[:3, 3]
         across = (ray**2).sum(1)[:, None, None] * np.eye(3) - ray[:, :, None] * ray[:, None, :]
         is_shown = np.isin(points, online.shown[other])
