@@ -481,7 +481,7 @@ def pose_at(online: Online, number: int) -> Float[np.ndarray, "4 4"] | None:
 
 
 def measure(online: Online, number: int) -> None:
-    """Estimate the covariance of a frame's pose, see `Structure`, from its points and theirs from the other keyframes."""
+    """Estimate the covariance of a frame's pose, see `Structure`, from its points and theirs from other keyframes."""
     T, points = pose_at(online, number), shown_by(online, number)
     others = sorted((abs(one - number), one) for one in online.placed_frames() if one != number)[:NUM_LOCAL]
     information = np.zeros((len(points), 3, 3))
