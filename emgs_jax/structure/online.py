@@ -253,7 +253,7 @@ def begin(online: Online, newest: int) -> None:
             break
         mapper.adjust_global_bundle(options, adjustment)
         mapper.filter_points(options)
-        for number in waiting:
+        for number in (*reversed(waiting), *waiting):  # from the newest back; then those whose points came later
             if not model.images[number + 1].has_pose and mapper.register_next_image(options, number + 1):
                 mapper.triangulate_image(triangulation, number + 1)
                 mapper.iterative_local_refinement(2, 1e-3, options, adjustment, triangulation, number + 1)
