@@ -42,14 +42,21 @@ def of_camera(word: str, given: list[str]) -> list[str]:
     keys = keys_of(given)
     source = word.removeprefix("camera").removeprefix(":") or "0"
     found = {"dataset": "camera", "dataset.source": written(source)}
-    if keys.get("prior", "multiview_stereo") == "multiview_stereo":  # it needs all images before it begins
-        found |= {"prior": "multiview_stereo", "dataset.intrinsics": "estimate"}
-        found |= {} if "baseline" in keys else {"graph": "up_to_scale"}
-        found |= {"dataset.fps": str(FPS), "dataset.record": "true"}
+    if keys.get("prior", "multiview_stereo") == "multiview_stereo":
+        found |= {"prior": "multiview_stereo", **({} if "baseline" in keys else {"graph": "up_to_scale"})}
+        is_known = keys.get("dataset.intrinsics", "estimate") not in ("estimate", "null")
+        is_online = keys.get("prior.structure.online", str(is_known)).lower() == "true"
+        if is_online:
+            found |= {"prior.structure.online": "true"}
+        else:  # it needs all images before it begins
+            found |= {"dataset.intrinsics": "estimate", "dataset.fps": str(FPS), "dataset.record": "true"}
     words = [f"{key}={value}" for key, value in found.items() if key not in keys]
     print(f"settings for camera {source}: {' '.join(words)} (your own win)")
-    if found.get("prior") is not None:
-        print("the images are recorded until Ctrl-C (or dataset.max_seconds=60), and mapped then")
+    if "prior.structure.online" in found:
+        print("move the camera sideways: the map begins when two images have parallax")
+    elif "prior" in found:
+        print("the images are recorded until Ctrl-C (or dataset.max_seconds=60), and mapped then; with")
+        print("dataset.intrinsics=[fx,fy,cx,cy] they are mapped while they come")
     return [*words, *given]
 
 

@@ -126,6 +126,12 @@ def _relative_pose(poses: Sequence[np.ndarray], log_scales: Sequence[float], row
     return scale_pose(np.linalg.inv(poses[-1]) @ poses[row], np.exp(-log_scales[-1]))
 
 
+def measured_again(factor: Factor, poses: Sequence[np.ndarray], log_scales: Sequence[float]) -> Factor:
+    """Return a factor, other than of a loop, with the relative pose that two nodes have now."""
+    Z_a_b = scale_pose(np.linalg.inv(poses[factor.a]) @ poses[factor.b], np.exp(-log_scales[factor.a]))
+    return factor if factor.is_loop else factor._replace(Z_a_b=Z_a_b)
+
+
 def loop_factor(loop: LoopMeasurement) -> Factor:
     """Build the loop factor of a verified loop."""
     return Factor(loop.a, loop.b, loop.Z_a_b, loop.log_ratio, loop.sqrt_info, is_loop=True)

@@ -1,7 +1,7 @@
 """Optimize the pose graph and deform the state of a run: map, last frame and its pose follow the nodes."""
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import equinox as eqx
@@ -11,8 +11,8 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
-from emgs_jax.back_end.factors import loop_factor, stack_factors
-from emgs_jax.back_end.state import BackEnd, Closure
+from emgs_jax.back_end.factors import loop_factor, measured_again, stack_factors
+from emgs_jax.back_end.state import BackEnd, Closure, Node
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.existence import ExistenceConfig, merge_all_duplicates
 from emgs_jax.layers import one_layer
@@ -52,6 +52,30 @@ def close_loops(end: BackEnd, state: SlamState, loops: Sequence[LoopMeasurement]
     change = jnp.mean(after.log_scale - before.log_scale, where=before.valid)
     state = replace(state, estimate=rescale_estimate(state.estimate, jnp.exp(change)))
     return end, deform_state(state, before, after, end.min_std, end.config.deform)
+
+
+def follow_prior(
+    end: BackEnd, state: SlamState, adjusted: Mapping[int, np.ndarray], T_world_anchor: np.ndarray
+) -> tuple[BackEnd, SlamState]:
+    """Move nodes and map with the poses that the prior has changed.
+
+    What a pose was first estimated to be beside its prediction stays; corrections by loops are replaced.
+
+    Args:
+        adjusted: by frame, T_anchor_camera (4, 4) as the prior knows it now.
+    """
+
+    def moved(node: Node) -> Node:
+        new, old = adjusted.get(node.frame), node.predicted
+        if node.submap != end.active or new is None or old is None or not np.isfinite([new, old]).all():
+            return node
+        beside = np.linalg.inv(T_world_anchor @ old) @ node.online
+        return replace(node, pose=T_world_anchor @ new @ beside)
+
+    after = replace(end, nodes=tuple(map(moved, end.nodes)))
+    factors = [measured_again(factor, after.poses, after.log_scales) for factor in end.factors]
+    nodes = nodes_of(end, end.active), nodes_of(after, end.active)
+    return replace(after, factors=factors), deform_state(state, *nodes, end.min_std, end.config.deform)
 
 
 def nodes_of(end: BackEnd, submap_id: int | None = None) -> Nodes:

@@ -62,6 +62,7 @@ class Node:
         covariance: (6, 6) of `online`, see `FrameRecord`; None without one, or in a saved map, which counts as exact.
         origin: node whose Gaussians it was registered to; None if it was not registered.
         depth_noise: difference of its points from the map, as a fraction of their depth; None if it was not registered.
+        predicted: T_anchor_camera (4, 4) as the prior predicted it; None without one.
     """
 
     pose: np.ndarray
@@ -73,6 +74,7 @@ class Node:
     covariance: np.ndarray | None = None
     origin: int | None = None
     depth_noise: float | None = None
+    predicted: np.ndarray | None = None
 
 
 @dataclass(frozen=True)
@@ -153,6 +155,7 @@ def add_node(
     """
     time, pose = len(end.nodes), np.asarray(pose, np.float64)
     known = {"covariance": frame.covariance, "origin": origin, "depth_noise": frame.depth_noise}
+    known["predicted"] = frame.T_anchor_views.get(frame.index)
     node = Node(pose, pose, float(np.log(scale)), frame.index, end.active, is_placed, **known)
     end = replace(end, nodes=(*end.nodes, node))
     if end.config is None:

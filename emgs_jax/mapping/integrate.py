@@ -16,7 +16,7 @@ from emgs_jax.back_end.loops import (
     remove_inconsistent,
     violated,
 )
-from emgs_jax.back_end.optimization import close_loops, merge_duplicates_of_state
+from emgs_jax.back_end.optimization import close_loops, follow_prior, merge_duplicates_of_state
 from emgs_jax.back_end.state import BackEnd, add_node
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.device.clock import Clock, Timer
@@ -40,6 +40,10 @@ def integrate(
     """
     clock = clock or Clock()
     timer = Timer(clock)
+    if window.adjusted and can_follow(atlas):
+        with clock.phase("back_end"):
+            graph, state = follow_prior(atlas.graph, atlas.state, window.adjusted, window.T_world_anchor)
+        atlas = with_state(replace(atlas, graph=graph), state, atlas.config)
     atlas, event, found = place(atlas, window)
     event = replace(event, seconds=seconds_of(window, timer))
     atlas = replace(atlas, num_lost=0 if event.is_placed else atlas.num_lost + 1)
@@ -48,6 +52,12 @@ def integrate(
         event = replace(event, seen=seen)
     with contextlib.nullcontext() if atlas.graph.config is None else clock.phase("back_end"):
         return update_graph(atlas, window, event, found, query), event
+
+
+def can_follow(atlas: Atlas) -> bool:
+    """Test whether the active submap lies in the prior's first world, and a back end moves it."""
+    is_there = atlas.state is not None and not atlas.is_frozen and atlas.graph.config is not None
+    return is_there and atlas.world.number == 0 and atlas.world.motion is None
 
 
 def seconds_of(window: WindowInput, timer: Timer, num_sharing: int = 1) -> Mapping[str, float]:

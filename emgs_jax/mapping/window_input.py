@@ -2,7 +2,7 @@
 
 from collections import ChainMap
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -45,6 +45,7 @@ class WindowInput:
         seconds: of the conversion.
         world: number of the world of `T_anchor_views`, see `PriorPrediction`; 0: that of the first frame. In any other
             world `prediction` has no pose, because the camera's pose in the map is unknown.
+        adjusted: poses of earlier frames that the prior has changed, see `PriorPrediction`.
     """
 
     frames: tuple[Frame, ...]
@@ -54,6 +55,7 @@ class WindowInput:
     T_anchor_views: Mapping[int, np.ndarray]
     seconds: Mapping[str, float]
     world: int = 0
+    adjusted: Mapping[int, np.ndarray] = field(default_factory=dict)
 
     @property
     def data(self) -> list[FrameData]:
@@ -131,8 +133,8 @@ class PredictedWindow(NamedTuple):
     ) -> WindowInput:
         """Make an input of some of its frames."""
         frames, raw = (tuple(values[index] for index in indices) for values in (self.frames, self.raw))
-        poses = _poses(self.prediction)
-        return WindowInput(frames, raw, prediction, self.T_world_anchor, poses, seconds, self.world)
+        poses, adjusted = _poses(self.prediction), self.prediction.adjusted
+        return WindowInput(frames, raw, prediction, self.T_world_anchor, poses, seconds, self.world, adjusted)
 
 
 def _step(window: PredictedWindow, config: SlamConfig, timer: Timer) -> list[WindowInput]:

@@ -2,7 +2,7 @@
 
 import itertools
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -52,6 +52,8 @@ class PriorPrediction:
             if they are triangulated from these poses. None: the prior does not tell. Needs `pose_covariance`.
         world: number of the poses' frame of reference, 0 for the first, which may come back. None: a new one begins
             where no view has a pose as before.
+        adjusted: T_anchor_view (4, 4), in world 0, of frames before the current one whose poses are other ones than
+            when they were predicted: the map follows. Recordings have none.
     """
 
     window: Window
@@ -63,6 +65,7 @@ class PriorPrediction:
     pose_covariance: np.ndarray | None = None
     scale_std: float | None = None
     world: int | None = None
+    adjusted: Mapping[int, np.ndarray] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

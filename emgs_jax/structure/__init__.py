@@ -1,1 +1,1 @@
-"""Structure from motion of all images at once, by COLMAP."""
+"""Structure from motion by COLMAP, of all images at once or of those that have come."""

@@ -35,6 +35,7 @@ class StructureConfig:
     overlap: int = number(10, low=1, high=1000)  # of more images: neighbours on each side, and powers of two beyond
     num_similar: int = number(5, low=0, high=1000)  # and images that place recognition proposes for each
     min_inliers: int = number(15, low=4, high=1000)  # of a frame that is registered at the end
+    online: bool = False  # poses of the images so far, as they come, by an intrinsic calibration that is known
     median_depth: float = number(2.0, low=1e-6, high=1e6)  # of the landmarks: the unit; a given model keeps its own
     pixel_std: float = number(0.4, low=1e-3, high=100)  # least standard deviation of a keypoint
     # further options by part (extraction, matching, verification, incremental, global)

@@ -36,6 +36,7 @@ class Structure:
     # the camera's axes; NaN where unknown.
     covariance: np.ndarray
     landmarks: Sequence[np.ndarray]  # rows of the world's points that each frame shows
+    num_adjusted: int = 0  # frames at the last adjustment of all
 
     @property
     def is_placed(self) -> np.ndarray:

@@ -7,13 +7,15 @@ from typing import Any
 
 import numpy as np
 
-from emgs_jax.data.base import Dataset
+from emgs_jax.data.base import BadFrameError, Dataset
 from emgs_jax.data.camera_models import PERSPECTIVE, Calibration, from_colmap, to_pycolmap
 from emgs_jax.data.intrinsics import Pictures, from_exif
 from emgs_jax.data.masks import image_names, names_of
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import in_use
+from emgs_jax.structure.library import load
 from emgs_jax.structure.model import Structure, to_structure
+from emgs_jax.structure.online import CAMERA, Online, add, newest
 from emgs_jax.structure.shots import Shots
 from emgs_jax.structure.store import make_models, models_of
 
@@ -34,6 +36,36 @@ def structure_of(dataset: Dataset, config: StructureConfig, folder: Path | None)
     shots = Shots(names, read, size, camera, is_calibrated=True, mask=masks)
     _, models = make_models(shots, config, folder)
     return to_structure(models, names, config), is_straight
+
+
+def follow_images(dataset: Dataset, config: StructureConfig) -> Callable[[int], Structure]:
+    """Return a function that gives the structure of the images so far, once that of this number has come.
+
+    It takes more images only as long as no structure has begun.
+    """
+    read, size, intrinsics = full_images(dataset)
+    model, parameters = pinhole_of(intrinsics, config)
+    camera = load().Camera(model=model, width=size[0], height=size[1], params=parameters, camera_id=CAMERA)
+    camera.has_prior_focal_length = True
+    mask = getattr(dataset, "full_mask", None) or (lambda index: None)
+    online, known = Online(camera, config), {}
+
+    def image_of(index: int) -> np.ndarray | None:
+        try:
+            return read(index)
+        except BadFrameError:
+            return None
+
+    def up_to(frame: int) -> Structure:
+        while (online.num_frames <= frame or not online.has_begun) and dataset.has(online.num_frames):
+            index = online.num_frames
+            add(online, image_of(index), mask(index))
+        if online.num_frames not in known:
+            known.clear()
+            known[online.num_frames] = newest(online)
+        return known[online.num_frames]
+
+    return up_to
 
 
 def calibrate(

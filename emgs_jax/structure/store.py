@@ -26,7 +26,7 @@ from emgs_jax.structure.shots import Shots
 
 ABOUT = "structure.json"
 VERSION = 2  # changes with the code of `structure/`, if that makes other models of the same images
-NOT_OF_MODELS = ("model", "median_depth", "pixel_std")  # settings that do not change the models
+NOT_OF_MODELS = ("model", "online", "median_depth", "pixel_std")  # settings that do not change the models
 CACHE = Path("~/.cache/emgs_jax/structure")
 
 

@@ -12,7 +12,7 @@ import pytest
 from scene import assert_same, device, random_gaussians, random_observation
 
 from emgs_jax import back_end, load_config
-from emgs_jax.back_end.factors import FrameData, map_factor, sequential_factor, stack_factors
+from emgs_jax.back_end.factors import Factor, FrameData, map_factor, sequential_factor, stack_factors
 from emgs_jax.back_end.loops import (
     consistent_loops,
     is_closure_due,
@@ -26,6 +26,7 @@ from emgs_jax.back_end.optimization import (
     close_loops,
     deform_state,
     depth_noise_of,
+    follow_prior,
     merge_duplicates_of_state,
     nodes_of,
     one_layer_of_state,
@@ -554,3 +555,38 @@ def test_one_layer_has_the_rows_of_what_the_first_nodes_have_made(graph):
     after = one_layer_of_state(state, end, [False, True], load_config().slam.existence)
     np.testing.assert_array_equal(after.map.gaussians.valid, [True, False, False, True])
     np.testing.assert_allclose(np.asarray(after.map.gaussians.means)[[0, 3], 2], 3.02, atol=1e-5)
+
+
+def test_the_map_follows_poses_that_the_prior_changes_and_loops_of_the_graph_give_way(graph):
+    """The second node moves by 30 cm; what registration had added to its prediction stays, what a loop had, goes."""
+    graph = replace(graph, deform=replace(graph.deform, num_neighbours=1))  # each Gaussian with its own node
+    end, state = sheets(graph, [0, 0, 1, 1], (8.0, 0.0, 3.0))
+    state = replace(state, time=jnp.asarray(2, jnp.int32))
+    anchor = shifted(1.0, 0.0, 0.0)  # of the first frame in the world
+    predicted = [np.eye(4), np.linalg.inv(anchor) @ shifted(7.9, 0.0, 3.0)]  # 10 cm beside the estimate
+    online = [np.eye(4), shifted(8.0, 0.0, 3.0)]
+    nodes = [
+        replace(node, online=pose, predicted=one) for node, pose, one in zip(end.nodes, online, predicted, strict=True)
+    ]
+    nodes[1] = replace(nodes[1], pose=shifted(8.0, 0.5, 3.0))  # by a loop
+    factor = Factor(1, 0, np.linalg.inv(nodes[1].pose), 0.0, np.eye(7), is_loop=False)
+    end = replace(end, nodes=tuple(nodes), factors=[factor, factor._replace(is_loop=True)])
+    adjusted = {1: predicted[1] @ shifted(0.0, 0.0, 0.3), 7: np.eye(4)}
+    after, moved = follow_prior(end, state, adjusted, anchor)
+    np.testing.assert_allclose(after.nodes[0].pose, end.nodes[0].pose)
+    np.testing.assert_allclose(after.nodes[1].pose[:3, 3], [8.0, 0.0, 3.3], atol=1e-9)
+    np.testing.assert_allclose(after.factors[0].Z_a_b, np.linalg.inv(after.nodes[1].pose), atol=1e-9)
+    np.testing.assert_array_equal(after.factors[1].Z_a_b, factor.Z_a_b)  # a loop is measured
+    means, before = (np.asarray(one.map.gaussians.means) for one in (moved, state))
+    np.testing.assert_array_equal(means[:2], before[:2])
+    np.testing.assert_allclose(means[2:] - before[2:], [[0, -0.5, 0.3]] * 2, atol=1e-5)
+    same, untouched = follow_prior(end, state, {}, anchor)
+    assert_same(untouched.map, state.map)
+    assert [node.pose is other.pose for node, other in zip(same.nodes, end.nodes, strict=True)] == [True, True]
+
+
+def shifted(*translation: float) -> np.ndarray:
+    """A pose (4, 4) without rotation."""
+    T = np.eye(4)
+    T[:3, 3] = translation
+    return T

@@ -133,3 +133,16 @@ def test_frames_keep_the_shape_of_the_image_and_have_as_many_pixels_as_those_of_
     assert abs(np.log(width / height * size[1] / size[0])) <= rounding
     assert abs(np.log(width * height / (320 * 240))) <= rounding
     assert size != (4032, 3024) or (width, height) == (320, 240)
+
+
+def test_a_camera_that_is_calibrated_is_mapped_while_it_runs(capsys):
+    known = "dataset.intrinsics=[90,90,48,32]"
+    found = keys_of(with_source(["camera:1", known]))
+    assert found["prior.structure.online"] == "true" and found["prior"] == "multiview_stereo"
+    assert found["dataset.intrinsics"] == "[90,90,48,32]" and not {"dataset.fps", "dataset.record"} & {*found}
+    assert "while" not in capsys.readouterr().out
+    for words in ([], ["dataset.intrinsics=estimate"], [known, "prior.structure.online=false"]):
+        found = keys_of(with_source(["camera:1", *words]))
+        assert found["dataset.record"] == "true" and found.get("prior.structure.online") != "true", words
+        assert "they are mapped while they come" in capsys.readouterr().out
+    assert not {"prior.structure.online", "dataset.record"} & {*keys_of(with_source(["camera", "prior=stream"]))}

@@ -28,8 +28,8 @@ class Scene(NamedTuple):
     """Frames with poses."""
 
     dataset: Dataset
-    structure: Structure
-    lenses: list[Lens]  # one for each world of the structure
+    newest: Callable[[], Structure]  # of the frames that have come
+    lens: Callable[[int], Lens]  # of a world
     camera: Camera  # pinhole camera of all frames
 
 
@@ -49,8 +49,10 @@ Depths = Callable[[int], Depth]  # of a frame that the structure has placed
 class Way:
     """A method for dense depth."""
 
-    begin: Callable[[Scene], tuple[Structure, Depths]]  # the structure, maybe in another unit, and the frames' depths
+    # The newest structure, maybe in another unit, and the frames' depths.
+    begin: Callable[[Scene], tuple[Callable[[], Structure], Depths]]
     check: Callable[[Dataset], None] = lambda dataset: None  # raises ValueError if it does not fit a data set
+    needs_all: bool = False  # one fit to all frames, which an online structure does not have
     contents: Mapping[str, Any] = field(default_factory=dict)  # digest of its files, for provenance
 
 

@@ -59,16 +59,16 @@ def way_of_files(config: DepthFilesConfig) -> Way:
         if config.kind == "metric" and np.isfinite(values).any():
             check_metres(float(np.nanmedian(values)), str(found.files[0]), IN_METRES)
 
-    def begin(scene: Scene) -> tuple[Structure, Depths]:
+    def begin(scene: Scene) -> tuple[Callable[[], Structure], Depths]:
         read = _reader(scene.dataset, found, folder)
 
         def values(frame: int) -> np.ndarray:
-            return rectify(read(frame), scene.lenses[scene.structure.world[frame]])
+            return rectify(read(frame), scene.lens(scene.newest().world[frame]))
 
         return begin_monocular(scene, values, config)
 
     root = folder if folder.is_dir() else folder.parent
-    return Way(begin, check, {"fingerprint": fingerprint(root, found.files, {})})
+    return Way(begin, check, needs_all=True, contents={"fingerprint": fingerprint(root, found.files, {})})
 
 
 def open_depths(folder: Path, kind: str, depth_scale: float) -> DepthFiles:

@@ -39,15 +39,15 @@ class Stereo(NamedTuple):
     estimate: Callable[[Any, Sources, Float[Array, "2"], Camera], tuple[np.ndarray, np.ndarray]]
 
 
-def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[Structure, Depths]:
+def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[Callable[[], Structure], Depths]:
     """Begin depth of each frame by stereo with its sources."""
-    found = scene.structure
 
     @lru_cache(NUM_KEPT)
     def view(frame: int) -> Any:
-        return stereo.prepare(scene.dataset[frame].image, scene.lenses[found.world[frame]])
+        return stereo.prepare(scene.dataset[frame].image, scene.lens(scene.newest().world[frame]))
 
     def depth_of(frame: int) -> Depth:
+        found = scene.newest()
         others, z = chosen(found, frame, config), found.depths(frame)
         z = z[z > 0]
         if not others or not len(z):
@@ -59,7 +59,7 @@ def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[
         pixels = jitted_pixels(jnp.asarray(depth), sources._replace(views=None), scene.camera)
         return Depth(depth, spread, np.asarray(pixels))
 
-    return found, depth_of
+    return scene.newest, depth_of
 
 
 def chosen(found: Structure, frame: int, config: MatchedConfig) -> list[int]:

@@ -35,13 +35,13 @@ class MonocularConfig(DenseConfig):
 
 def begin_monocular(
     scene: Scene, values: Callable[[int], Float[np.ndarray, "h w"]], config: MonocularConfig
-) -> tuple[Structure, Depths]:
-    """The structure, in metres if the network's depths are, and the depth of each frame.
+) -> tuple[Callable[[], Structure], Depths]:
+    """The newest structure, in metres if the network's depths are, and the depth of each frame.
 
     `values` maps a frame to the network's values at the pinhole camera's pixels, NaN = none. Raises as
     `fit_to_landmarks`.
     """
-    found, fits, rows = scene.structure, [], {}
+    found, fits, rows = scene.newest(), [], {}
     for world in range(len(found.worlds)):
         frames = np.flatnonzero((found.world == world) & found.is_placed)
         rows |= {int(frame): row for row, frame in enumerate(frames)}
@@ -61,7 +61,7 @@ def begin_monocular(
         scale_std = float(np.sqrt(fits[world].covariance[rows[frame], 0, 0]))
         return Depth(np.where(is_near, depth, 0.0), std, np.float32(is_near), scale_std)
 
-    return found, depth_of
+    return lambda: found, depth_of
 
 
 def _depths(found: Structure, world: int) -> np.ndarray:
@@ -73,8 +73,9 @@ def _fit(
     scene: Scene, world: int, frames: np.ndarray, values: Callable[[int], np.ndarray], config: MonocularConfig
 ) -> LandmarkFit:
     """Fit scale and shift of a world's frames, and report the fit."""
-    information = point_information(scene.structure, world, config.pixel_std)
-    landmarks = [landmarks_of(scene.structure, frame, information, scene.camera, config.cell) for frame in frames]
+    structure = scene.newest()
+    information = point_information(structure, world, config.pixel_std)
+    landmarks = [landmarks_of(structure, frame, information, scene.camera, config.cell) for frame in frames]
     said = []
     for frame, found in zip(frames, landmarks, strict=True):
         column, row = np.rint(found.pixels).astype(int).T

@@ -1,5 +1,6 @@
 """Dense depth by METER, a small monocular network, whose weights the user brings."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -34,16 +35,16 @@ def way_of_meter(config: MeterConfig) -> Way:
     """Depth by METER; ValueError unless the file holds the published weights."""
     network = load_network(config.checkpoint, config.sha256, SOURCE, None, build_network)
 
-    def begin(scene: Scene) -> tuple[Structure, Depths]:
+    def begin(scene: Scene) -> tuple[Callable[[], Structure], Depths]:
         size = scene.camera.width, scene.camera.height
 
         @lru_cache(NUM_KEPT)
         def values(frame: int) -> np.ndarray:
-            lens = scene.lenses[scene.structure.world[frame]]
+            lens = scene.lens(scene.newest().world[frame])
             shown = rectify(np.float32(scene.dataset[frame].image), lens) / 255.0
             shown = cv2.resize(shown, (config.width, config.height), interpolation=cv2.INTER_AREA)
             return cv2.resize(np.asarray(jitted_predict(network, jnp.asarray(shown))), size)
 
         return begin_monocular(scene, values, config)
 
-    return Way(begin)
+    return Way(begin, needs_all=True)

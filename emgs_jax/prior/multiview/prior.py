@@ -1,15 +1,16 @@
 """The prior `multiview_stereo`: classical geometry from the images alone, without weights and without a GPU.
 
-COLMAP finds the poses of all images (`structure/`). Depth is from a plane sweep, with planes in blank regions
-(`swept.py`), from a stereo network (`learned.py`), or from a monocular network or files, fitted to COLMAP's landmarks
-(`monocular.py`). Its confidence is one over the standard deviation of log z (`depth_noise.py`), at least 1.
+COLMAP finds the poses of all images (`structure/`), or, online, of those that have come (`structure/online.py`). Depth
+is from a plane sweep, with planes in blank regions (`swept.py`), from a stereo network (`learned.py`), or from a
+monocular network or files, fitted to COLMAP's landmarks (`monocular.py`). Its confidence is one over the standard
+deviation of log z (`depth_noise.py`), at least 1.
 
 Every model of COLMAP is a world with its own frame and unit: its landmarks get the median depth `median_depth`. A
 prediction has the poses of the current frame's world. A frame that no model holds has no pose.
 """
 
-from collections.abc import Sequence
-from dataclasses import asdict
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, replace
 from functools import lru_cache, partial
 from pathlib import Path
 
@@ -38,7 +39,7 @@ from emgs_jax.scale.metres import ScaleConfig, View, metres_of
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import names_at
 from emgs_jax.structure.model import NONE, Structure, scaled
-from emgs_jax.structure.sequence import structure_of
+from emgs_jax.structure.sequence import follow_images, structure_of
 
 jitted_difference = eqx.filter_jit(mean_difference)
 NUM_KEPT = 64  # frames whose depths are cached
@@ -72,6 +73,12 @@ class MultiviewStereo(Prior):
 
     def __init__(self, structure: StructureConfig, dense: AnyDense, metres: ScaleConfig = ScaleConfig()) -> None:  # noqa: B008 (it is frozen)
         self._config, self._dense, self._way, self._metres = structure, dense, way_of(dense), metres
+        if structure.online and (self._way.needs_all or structure.model is not None or metres.is_given):
+            key = "scale=" if metres.is_given else "this prior/dense"
+            key = "prior.structure.model" if structure.model is not None else key
+            raise ValueError(
+                f"prior.structure.online=true makes poses as images come, and {key} needs all of them: use one"
+            )
         settings = {"structure": _values(structure), "dense": _described(dense, self._way)}
         if metres.is_given or getattr(dense, "kind", None) == "metric":
             settings["unit"] = "m"
@@ -80,16 +87,23 @@ class MultiviewStereo(Prior):
         self.provenance = Provenance("multiview_stereo", {"version": 14} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
-        self._found: Structure | None = None
+        self._up_to: Callable[[int], Structure] | None = None  # of the frames up to this one, at least
+        self._known: Structure | None = None
+        self._lenses: dict[tuple, Lens] = {}
+        self._num_adjusted = 0
         self._scale_std: float | None = None
 
     def num_newer(self, window_size: int) -> int:
-        """All but one: a structure knows all images, so the first frame alone begins the map."""
-        return window_size
+        """All but one: a structure knows all images, so the first frame alone begins the map. None online."""
+        return 0 if self._config.online else window_size
+
+    def num_first(self, window_size: int) -> int:
+        """One online: the structure itself waits until it can begin."""
+        return 1 if self._config.online else window_size
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Take the data set; ValueError if it has fewer than three images, or the depths are not of them."""
-        if wait_for_all(dataset) < 3:
+        if not self._config.online and wait_for_all(dataset) < 3:
             raise ValueError(
                 f"prior=multiview_stereo needs three images or more of one place, {dataset.name} {dataset.sequence} "
                 f"has {len(dataset)} in use: give more (dataset.stop, dataset.stride)"
@@ -98,23 +112,27 @@ class MultiviewStereo(Prior):
         self._dataset = dataset
 
     def keep(self, folder: Path) -> None:
-        """Make the structure in `folder`/structure, or load it from there."""
+        """Make the structure in `folder`/structure, or load it from there; an online one begins with the first call."""
         self._folder = folder / "structure"
-        self._prepare()
+        if not self._config.online:
+            self._take(0)
 
     def report(self) -> dict[str, float]:
         """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models, and, in
         metres by `scale=`, `prior/scale_std_percent`."""
-        if self._found is None:
+        if self._known is None:
             return {}
-        placed = 100 * float(self._found.is_placed.mean())
+        placed = 100 * float(self._known.is_placed.mean())
         known = {} if self._scale_std is None else {"prior/scale_std_percent": 100 * self._scale_std}
-        return {"prior/placed_percent": placed, "prior/num_worlds": len(self._found.worlds)} | known
+        return {"prior/placed_percent": placed, "prior/num_worlds": len(self._known.worlds)} | known
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict; a view that is in no model has NaN and no valid point."""
-        self._prepare()
-        structure, world = self._found, self._world_at(window.current)
+        structure = self._take(max(window.views))
+        return replace(self._predicted(structure, window), adjusted=self._adjusted(structure, window.current))
+
+    def _predicted(self, structure: Structure, window: Window) -> PriorPrediction:
+        world = self._world_at(window.current)
         T, spread = np.full((len(window.views), 4, 4), np.nan), np.full((len(window.views), 6, 6), np.nan)
         anchor = window.views[0]
         is_same = structure.world[anchor] == world
@@ -127,69 +145,92 @@ class MultiviewStereo(Prior):
         scale_std = np.float64(self._depths(current).scale_std) if structure.is_placed[current] else None
         return predicted(window, T, dense, pose_covariance=spread, scale_std=scale_std, world=world)
 
+    def _adjusted(self, structure: Structure, current: int) -> dict[int, np.ndarray]:
+        """The poses of earlier frames, relative to the first, where all were adjusted since the last call."""
+        was, self._num_adjusted = self._num_adjusted, structure.num_adjusted
+        if was == structure.num_adjusted or structure.world[0] == NONE:
+            return {}
+        T = np.linalg.inv(structure.T_world_camera[0]) @ structure.T_world_camera
+        return {frame: T[frame] for frame in range(current) if structure.is_placed[frame]}
+
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
         """Predict for views of two visits of a place; None unless they are in one world."""
-        self._prepare()
-        world = self._found.world[[window.views[0], window.current]]
+        structure = self._take(max(window.views))
+        world = structure.world[[window.views[0], window.current]]
         is_known = world[0] == world[1] != NONE
-        return self.predict(window, frames, intrinsics) if is_known else None
+        return self._predicted(structure, window) if is_known else None
 
-    def _prepare(self) -> None:
-        if self._found is not None:
-            return
+    def _take(self, frame: int) -> Structure:
+        """The structure of the images up to this one, or of more."""
         if self._dataset is None:
             raise ValueError("multiview_stereo makes a structure of a data set: call check(dataset, window_size) first")
+        if self._up_to is None:
+            (width, height), intrinsics = self._dataset.size, self._dataset.intrinsics
+            self._camera = Camera(np.float32(intrinsics[:2]), np.float32(intrinsics[2:]), width, height)
+            self._up_to, self._is_straight = self._begin()
+            self._known = self._up_to(frame)
+            self._newest, depths = self._way.begin(Scene(self._dataset, lambda: self._known, self._lens, self._camera))
+            self._depths = lru_cache(NUM_KEPT)(depths)  # a frame's neighbours ask for its depth again
+            if self._metres.is_given:
+                self._to_metres(self._newest())
+        self._known = self._up_to(frame)
+        return self._newest()
+
+    def _begin(self) -> tuple[Callable[[int], Structure], bool]:
+        """A function that gives the newest structure, see `_take`, and True if its images are undistorted."""
+        if self._config.online:
+            return follow_images(self._dataset, self._config), False
         if self._config.model is not None:
             names = names_at(Path(self._config.model).expanduser())
             check_names(self._dataset, names, f"prior.structure.model={self._config.model}")
-        (width, height), intrinsics = self._dataset.size, self._dataset.intrinsics
-        self._camera = Camera(np.float32(intrinsics[:2]), np.float32(intrinsics[2:]), width, height)
         found, is_straight = structure_of(self._dataset, self._config, self._folder)
-        pinhole = Lens(self._camera.focal, self._camera.center)
-        self._lenses = [
-            pinhole if is_straight else lens_of(world.camera, tuple(intrinsics), (width, height))
-            for world in found.worlds
-        ]
-        self._found, depths = self._way.begin(Scene(self._dataset, found, self._lenses, self._camera))
-        self._depths = lru_cache(NUM_KEPT)(depths)  # a frame's neighbours ask for its depth again
-        if self._metres.is_given:
-            self._to_metres()
+        return lambda frame: found, is_straight
 
-    def _to_metres(self) -> None:
+    def _to_metres(self, found: Structure) -> None:
         """Bring structure and depths into metres by the lengths that are known; other worlds keep their unit."""
 
         def view(frame: int) -> View:
             points, confidence, mask = self._answer(frame)
             return View(points, 1.0 / confidence, mask)
 
-        found, depths = (
-            metres_of(self._metres, self._dataset, self._found.T_world_camera, self._found.world, view),
-            self._depths,
-        )
-        factors = np.ones(len(found))
-        for world, (scale, _, notes) in enumerate(found):
-            of = f" of model {world}" if len(found) > 1 else ""
-            said = [] if scale is None else [f"± {100 * scale.std:.1f} %, by {scale.source}"]
-            tqdm.write(f"scale{of}: {'; '.join([*(said or ['unknown']), *notes])}")
+        each, depths = metres_of(self._metres, self._dataset, found.T_world_camera, found.world, view), self._depths
+        factors = np.ones(len(each))
+        for world, (scale, _, notes) in enumerate(each):
+            of = f" of model {world}" if len(each) > 1 else ""
+            said = ["unknown"] if scale is None else [f"± {100 * scale.std:.1f} %, by {scale.source}"]
+            tqdm.write(f"scale{of}: {'; '.join([*said, *notes])}")
             factors[world] = 1.0 if scale is None else scale.factor
-        self._scale_std = next(scale.std for scale, *_ in found if scale is not None)
-        self._found = scaled(self._found, factors)
+        self._scale_std = next(scale.std for scale, *_ in each if scale is not None)
+        in_metres = scaled(found, factors)
 
-        def in_metres(frame: int) -> Depth:
+        def depth_in_metres(frame: int) -> Depth:
             one = depths(frame)
-            return one._replace(depth=np.float32(factors[self._found.world[frame]]) * one.depth)
+            return one._replace(depth=np.float32(factors[found.world[frame]]) * one.depth)
 
-        self._depths = lru_cache(NUM_KEPT)(in_metres)
+        self._newest, self._depths = lambda: in_metres, lru_cache(NUM_KEPT)(depth_in_metres)
+
+    def _lens(self, world: int) -> Lens:
+        """The lens of the images of a world."""
+        if self._is_straight:
+            return Lens(self._camera.focal, self._camera.center)
+        camera = self._known.worlds[world].camera
+        parameters = camera.model_name, camera.width, camera.height, *map(float, camera.params)
+        if parameters not in self._lenses:  # an online structure adjusts it
+            intrinsics, size = tuple(self._dataset.intrinsics), (self._camera.width, self._camera.height)
+            self._lenses = {**dict([*self._lenses.items()][-1:]), parameters: lens_of(camera, intrinsics, size)}
+        return self._lenses[parameters]
 
     def _world_at(self, frame: int) -> int:
         """World of a frame, or of the last frame before it that has one."""
-        placed = np.flatnonzero(self._found.world[: frame + 1] != NONE)
-        return int(self._found.world[placed[-1]]) if len(placed) else 0
+        world = self._newest().world[: frame + 1]
+        placed = np.flatnonzero(world != NONE)
+        return int(world[placed[-1]]) if len(placed) else 0
 
     def _answer(self, frame: int) -> DenseView:
-        if not self._found.is_placed[frame]:
+        found = self._newest()
+        if not found.is_placed[frame]:
             return no_points((self._camera.width, self._camera.height))
-        lens, std = self._lenses[self._found.world[frame]], self._std(frame)
+        lens, std = self._lens(found.world[frame]), self._std(found, frame)
         is_sure = np.isfinite(std) & (std <= self._dense.noise.max_std)
         depth = np.float32(np.where(is_sure, self._depths(frame).depth, 0.0))
         depth, std = (as_shown(values, lens) for values in (depth, np.where(depth > 0, std, np.float32(np.inf))))
@@ -197,13 +238,13 @@ class MultiviewStereo(Prior):
         confidence = np.maximum(1.0 / np.where(mask, std, 1.0), np.float32(1.0))
         return points_shown(np.where(mask, depth, 0.0), lens), confidence, mask
 
-    def _std(self, frame: int) -> np.ndarray:
+    def _std(self, found: Structure, frame: int) -> np.ndarray:
         """Standard deviation of the log of each depth; inf where undetermined."""
         config, depths = self._dense, self._depths
         depth, spread, pixels, _ = depths(frame)
-        others = placed_beside(self._found, frame)[: config.num_checks]
+        others = placed_beside(found, frame)[: config.num_checks]
         if not others:
             return np.full_like(depth, np.inf)
-        seen = sources_of(self._found, frame, others, config.num_checks, lambda other: jnp.asarray(depths(other).depth))
+        seen = sources_of(found, frame, others, config.num_checks, lambda other: jnp.asarray(depths(other).depth))
         difference = jitted_difference(jnp.asarray(depth), seen, self._camera, jnp.float32(config.depth_step))
         return relative_std(pixels, spread, np.asarray(difference), config.noise)

@@ -1,0 +1,84 @@
+"""The prior whose structure grows with the images: what it asks for, predicts and corrects; refusals."""
+
+from functools import cache
+
+import numpy as np
+import pytest
+from hydra.errors import InstantiationException
+from scene import compose
+
+from emgs_jax.config.configure import build
+from emgs_jax.data.synthetic import Synthetic
+from emgs_jax.prior.base import calls_of, with_frames
+
+COUNT = 16
+WORDS = (
+    "prior=multiview_stereo",
+    "prior.structure.online=true",
+    "prior.structure.num_threads=1",
+    "prior.dense.depth.sweep.num_planes=24",
+)
+
+
+@cache
+def predicted():
+    """All windows of a walk, with the number of images that had been taken before each answer, and the walk."""
+    taken = []
+
+    class Walk(Synthetic):
+        def __getitem__(self, index):
+            taken.append(index)
+            return super().__getitem__(index)
+
+    dataset, prior = Walk(num_frames=40, stop=COUNT, size=(160, 120)), build(compose(*WORDS), "prior")
+    prior.check(dataset, 4)
+    found = []
+    for window, frames in with_frames(calls_of(prior, dataset, 4), dataset):
+        found.append((prior.predict(window, list(frames.values()), dataset.intrinsics), max(taken)))
+    return found, dataset, prior
+
+
+@pytest.mark.slow
+def test_each_frame_is_predicted_when_it_comes_without_later_ones():
+    found, _, prior = predicted()
+    begun = found[0][1]
+    assert [one.window.current for one, _ in found] == [*range(COUNT)] and 2 <= begun < COUNT - 1
+    assert [taken for _, taken in found] == [max(begun, frame) for frame in range(COUNT)]
+    assert prior.report()["prior/placed_percent"] == 100 and prior.provenance.settings["structure"]["online"]
+
+
+@pytest.mark.slow
+def test_depths_and_poses_are_the_true_ones_up_to_one_scale():
+    found, dataset, _ = predicted()
+    scales, shares = [], []
+    for one, _ in found:
+        depth, z = dataset[one.window.current].depth, one.points[-1, ..., 2]
+        is_known = one.mask[-1] & (depth > 0)
+        shares.append(is_known.mean())
+        scales.append(np.median(z[is_known] / depth[is_known]))
+        assert np.median(np.abs(z[is_known] / depth[is_known] / scales[-1] - 1)) < 0.05
+    assert np.std(np.log(scales)) < 0.05 and np.mean(shares) > 0.3
+    last = found[-1][0]
+    row = last.window.views.index(COUNT - 1)
+    true = np.linalg.inv(dataset.pose(0)) @ dataset.pose(COUNT - 1)
+    assert np.linalg.norm(last.T_anchor_view[row, :3, 3] / np.median(scales) - true[:3, 3]) < 0.03
+    assert last.scale_std == 0 and np.isfinite(last.pose_covariance[row]).all()
+
+
+@pytest.mark.slow
+def test_adjusted_poses_are_told_once_for_all_earlier_frames():
+    found, _, _ = predicted()
+    told = [one for one, _ in found if one.adjusted]
+    assert told and not found[0][0].adjusted
+    for one in told:
+        assert [*one.adjusted] == [*range(one.window.current)]
+        for row, frame in enumerate(one.window.views[:-1]):
+            np.testing.assert_allclose(one.adjusted[frame], one.T_anchor_view[row], atol=1e-9)
+
+
+@pytest.mark.parametrize("words", [["prior.structure.model=somewhere"], ["prior/dense=files", "prior.dense.folder=."]])
+def test_what_needs_all_images_is_refused_online(words, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    np.save(tmp_path / "0.npy", np.ones((1, 4, 4), np.float32))
+    with pytest.raises(InstantiationException, match=r"online=true makes poses as images come, and .* needs all"):
+        build(compose(*WORDS[:2], *words), "prior")
