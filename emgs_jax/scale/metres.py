@@ -34,7 +34,7 @@ class ScaleConfig:
     positions: str | None = None  # of the cameras: exif (GPS of photos), or a file, see `read_positions`
     imu: str | None = None  # file of an inertial measurement unit, see `read_inertial`
     # camera → unit: 16 numbers row by row, or a sensor.yaml of the camera as EuRoC has
-    T_imu_camera: Sequence[float] | str | None = None
+    T_imu_camera: Sequence[float] | str | None = number(None, low=-1e3, high=1e3)
 
     def __post_init__(self) -> None:
         for one in self.distances:

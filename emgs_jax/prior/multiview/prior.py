@@ -71,7 +71,7 @@ def _values(config: StructureConfig | DenseConfig) -> dict:
 class MultiviewStereo(Prior):
     """Structure from motion of all images, and dense depth of each."""
 
-    def __init__(self, structure: StructureConfig, dense: AnyDense, metres: ScaleConfig = ScaleConfig()) -> None:  # noqa: B008 (it is frozen)
+    def __init__(self, structure: StructureConfig, dense: AnyDense, metres: ScaleConfig) -> None:
         self._config, self._dense, self._way, self._metres = structure, dense, way_of(dense), metres
         if structure.online and (self._way.needs_all or structure.model is not None or metres.is_given):
             key = "scale=" if metres.is_given else "this prior/dense"

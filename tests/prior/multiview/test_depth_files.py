@@ -180,7 +180,8 @@ def test_depths_of_the_room_come_back_in_the_unit_of_the_structure_or_in_metres(
     lens = Lens(camera.focal, camera.center)
     way = way_of_files(config(tmp_path, kind))
     way.check(drawn)
-    structure, depth_of = way.begin(Scene(drawn, found, [lens], camera))
+    newest, depth_of = way.begin(Scene(drawn, lambda: found, lambda world: lens, camera))
+    structure = newest()
     factor = 1.0 if kind == "metric" else 0.4
     np.testing.assert_allclose(
         structure.T_world_camera[-1, :3, 3], factor / 0.4 * found.T_world_camera[-1, :3, 3], rtol=1e-2

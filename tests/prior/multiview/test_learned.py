@@ -117,6 +117,8 @@ def test_the_network_is_shown_the_whole_image_and_its_depths_lie_at_the_images_p
     camera = Camera(np.float32([300, 300]), np.float32([200, 120]), 400, 240)
     lens = Lens(camera.focal, camera.center)
     frames, structure = [SimpleNamespace(image=image)], SimpleNamespace(world=np.array([0]))
-    values = monocular_network.way_of_meter(config).begin(Scene(frames, structure, [lens], camera))(0)
+    values = monocular_network.way_of_meter(config).begin(Scene(frames, lambda: structure, lambda world: lens, camera))(
+        0
+    )
     assert values.shape == (240, 400)
     np.testing.assert_allclose(values[:, 8:-8], image[:, 8:-8, 0] / 255, atol=0.01)
