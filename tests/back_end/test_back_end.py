@@ -349,6 +349,8 @@ def test_a_window_leads_to_what_is_placed_and_not_far_from_where_a_frame_was_est
     assert window_factor(seen, poses, scales, lambda row: row >= 44, graph.noise, (40, np.inf)).b == 44
     assert window_factor(seen, poses, scales, lambda row: row == 0, graph.noise, (40, np.inf)) is None
     assert window_factor(seen, poses, scales, lambda row: row == 0, graph.noise, (50, np.inf)).b == 0
+    seen.T_anchor_views[40][:] = np.nan
+    assert window_factor(seen, poses, scales, anywhere, graph.noise, (40, np.inf)).b == 41, "the prior knows no 40"
     off = list(ring(1.9 * np.pi)[:51])
     misfit = chi2(window_factor(seen, off, scales, anywhere, graph.noise, (40, np.inf)), off, scales)
     assert misfit > 0.1
