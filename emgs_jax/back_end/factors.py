@@ -1,4 +1,4 @@
-"""Factors of the pose graph that a frame adds: its pose relative to an earlier frame, and to the map."""
+"""Factors of the pose graph that a frame adds: its pose relative to earlier frames, and to the map."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.geometry import scale_pose
@@ -111,6 +112,51 @@ def sequential_factor(
     return Factor(
         time, row, _relative_pose(poses, log_scales, row), log_scales[row] - log_scales[time], weights, is_loop=False
     )
+
+
+def window_factor(
+    frame: FrameData,
+    poses: Sequence[np.ndarray],
+    log_scales: Sequence[float],
+    is_connected: Callable[[int], bool],
+    noise: NoiseConfig,
+    limits: tuple[float, float],
+) -> Factor | None:
+    """Build the window factor of a last frame that comes back: its predicted pose relative to the earliest view.
+
+    A frame that comes back is registered to what an earlier visit made, so its estimated pose repeats the errors of
+    that visit's path. What its inference predicts of the present path does not: it is a second measurement of a path
+    that was walked twice. Over the whole window it bends the path smoothly and roughens no surface. Its errors are
+    those of `noise.pair` over so many frames; the inference does not measure how scales change.
+
+    Args:
+        limits: largest number of nodes to that view, which an anchor of the earlier visit exceeds; and largest χ² at
+            the estimated poses, beyond which one of the two is no measurement of this path.
+
+    Returns:
+        The factor; None without one within the limits.
+    """
+    time, (max_gap, max_chi2) = len(poses) - 1, limits
+    known = {index: pose for index, pose in frame.T_anchor_views.items() if np.isfinite(pose).all()}
+    farthest = sorted((frame.index - index for index in known), reverse=True)
+    reach = min(time, max_gap)
+    offset = next((offset for offset in farthest if 0 < offset <= reach and is_connected(time - offset)), None)
+    if frame.index not in known or offset is None:
+        return None
+    measured = np.linalg.inv(known[frame.index]) @ known[frame.index - offset]
+    weights = _weights(frame, noise, np.sqrt(offset) * noise.pair)
+    factor = Factor(time, time - offset, measured, 0.0, weights, is_loop=False)
+    return factor if chi2(factor, poses, log_scales) <= max_chi2 else None
+
+
+def chi2(measured: Factor | LoopMeasurement, poses: Sequence[np.ndarray], log_scales: Sequence[float]) -> float:
+    """Compute χ² of a measurement at the poses and scales of all nodes."""
+    a, b = measured.a, measured.b
+    now = scale_pose(np.linalg.inv(poses[a]) @ poses[b], np.exp(-log_scales[a]))
+    error = np.linalg.inv(measured.Z_a_b) @ now
+    turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
+    residual = [*error[:3, 3], *turn, log_scales[b] - log_scales[a] - measured.log_ratio]
+    return float(np.sum((measured.sqrt_info @ residual) ** 2))
 
 
 def map_factor(

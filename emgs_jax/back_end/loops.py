@@ -4,12 +4,8 @@ import math
 from collections.abc import Sequence
 from dataclasses import replace
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
-from emgs_jax.back_end.factors import FrameData
+from emgs_jax.back_end.factors import FrameData, chi2
 from emgs_jax.back_end.state import BackEnd, Refusal
-from emgs_jax.geometry import scale_pose
 from emgs_jax.loop_closure.consistency import spatially_consistent
 from emgs_jax.loop_closure.place_recognition import (
     Keyframe,
@@ -159,13 +155,7 @@ def violated(end: BackEnd, loops: Sequence[LoopMeasurement]) -> list[LoopMeasure
 
 def loop_chi2(end: BackEnd, loop: LoopMeasurement) -> float:
     """Compute χ² of a loop at the current poses and scales."""
-    here, there = end.nodes[loop.a], end.nodes[loop.b]
-    now = scale_pose(np.linalg.inv(here.pose) @ there.pose, np.exp(-here.log_scale))
-    error = np.linalg.inv(loop.Z_a_b) @ now
-    turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
-    return float(
-        np.sum((loop.sqrt_info @ [*error[:3, 3], *turn, there.log_scale - here.log_scale - loop.log_ratio]) ** 2)
-    )
+    return chi2(loop, end.poses, end.log_scales)
 
 
 def query_prior(end: BackEnd, loops: Sequence[LoopMeasurement], query: PriorQuery) -> BackEnd:

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emgs_jax.back_end.factors import Factor, FrameData, NoiseConfig, map_factor, sequential_factor
+from emgs_jax.back_end.factors import Factor, FrameData, NoiseConfig, map_factor, sequential_factor, window_factor
 from emgs_jax.geometry import Sim3, scale_covariance
 from emgs_jax.loop_closure.consistency import ConsistencyConfig
 from emgs_jax.loop_closure.place_recognition import Database, PlaceRecognitionConfig
@@ -29,8 +29,8 @@ class BackEndConfig:
 
     Args:
         every: frames between keyframes.
-        min_violation: χ² of a loop at the current poses beyond which it violates them. Only such a loop starts a
-            closure and a query of the prior.
+        min_violation: χ² of a measurement at the current poses beyond which it violates them. Only such a loop starts
+            a closure and a query of the prior, and such a window factor is left out.
         min_frames: between two closures.
         deform: deformation of the map with the optimized poses.
     """
@@ -146,7 +146,7 @@ class BackEnd:
 def add_node(
     end: BackEnd, frame: FrameData, pose: np.ndarray, scale: float, origin: int | None, is_placed: bool = True
 ) -> BackEnd:
-    """Add a node with the pose of its frame, and its sequential and map factors.
+    """Add a node with the pose of its frame, and its sequential and map factors; and a window factor if it comes back.
 
     Args:
         scale: of its inference.
@@ -160,11 +160,14 @@ def add_node(
     end = replace(end, nodes=(*end.nodes, node))
     if end.config is None:
         return end
-    sequential = sequential_factor(frame, end.poses, end.log_scales, partial(_is_connected, end), end.config.noise)
-    factors = [] if sequential is None else [sequential]
+    known, noise = (frame, end.poses, end.log_scales), end.config.noise
+    is_connected = partial(_is_connected, end)
+    factors = [sequential_factor(*known, is_connected, noise)]
     if origin is not None and origin < time:
-        factors.append(map_factor(frame, end.poses, end.log_scales, origin, end.config.noise))
-    return replace(end, factors=[*end.factors, *factors])
+        factors.append(map_factor(*known, origin, noise))
+        if time - origin > (visit := float(end.config.deform.max_gap)):
+            factors.append(window_factor(*known, is_connected, noise, (visit, end.config.min_violation)))
+    return replace(end, factors=[*end.factors, *filter(None, factors)])
 
 
 def _is_connected(end: BackEnd, row: int) -> bool:

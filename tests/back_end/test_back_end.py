@@ -12,7 +12,15 @@ import pytest
 from scene import assert_same, device, random_gaussians, random_observation
 
 from emgs_jax import back_end, load_config
-from emgs_jax.back_end.factors import Factor, FrameData, map_factor, sequential_factor, stack_factors
+from emgs_jax.back_end.factors import (
+    Factor,
+    FrameData,
+    chi2,
+    map_factor,
+    sequential_factor,
+    stack_factors,
+    window_factor,
+)
 from emgs_jax.back_end.loops import (
     consistent_loops,
     is_closure_due,
@@ -66,8 +74,12 @@ def graph():
 
 def ring(turn: float = 2 * np.pi) -> np.ndarray:
     """Camera poses (n, 4, 4) along a ring of 2 m that the last one closes; less than a turn drifts."""
-    poses = np.tile(np.eye(4), (COUNT, 1, 1))
-    for pose, angle in zip(poses, turn * np.arange(COUNT) / (COUNT - 1), strict=True):
+    return on_ring(turn * np.arange(COUNT) / (COUNT - 1))
+
+
+def on_ring(angles: np.ndarray) -> np.ndarray:
+    poses = np.tile(np.eye(4), (len(angles), 1, 1))
+    for pose, angle in zip(poses, angles, strict=True):
         pose[:3, :3] = [[np.cos(angle), 0, np.sin(angle)], [0, 1, 0], [-np.sin(angle), 0, np.cos(angle)]]
         pose[:3, 3] = 2 * np.sin(angle), 0, 2 * np.cos(angle) - 2
     return poses
@@ -326,6 +338,64 @@ def test_what_is_measured_is_as_sure_as_the_depths_that_it_was_measured_by(graph
     assert 1e3 < exact.sqrt_info[0, 0] < 1e5, "more certain than any loop, and finite"
     first = map_factor(blind, poses, scales, 12, graph.noise)
     np.testing.assert_allclose(1 / np.diag(first.sqrt_info)[:6], graph.noise.depth * graph.noise.map)
+
+
+def test_a_frame_that_comes_back_is_also_measured_over_its_window_as_the_prior_predicted(graph):
+    """In the unit of its inference; its own path says nothing of what the earlier visit got wrong."""
+    placed, scales = list(ring(1.98 * np.pi)[:51]), [0.0] * 50 + [np.log(1.1)]
+    edge = window_factor(look(ring(), 50), placed, scales, anywhere, graph.noise, (40, np.inf))
+    assert (edge.a, edge.b) == (50, 40) and not edge.is_loop, "the earliest view of its window, but not the anchor"
+    np.testing.assert_allclose(edge.Z_a_b, np.linalg.inv(ring()[50]) @ ring()[40], atol=1e-12)
+    chain = sequential_factor(look(ring(), 50), placed, scales, anywhere, graph.noise)
+    np.testing.assert_allclose(edge.sqrt_info[:6, :6] * np.sqrt(10), chain.sqrt_info[:6, :6])
+    assert edge.sqrt_info[6, 6] == 0, "one inference has one scale"
+
+
+def test_a_window_leads_to_what_is_placed_and_not_far_from_where_a_frame_was_estimated(graph):
+    poses, scales, seen = list(ring()[:51]), [0.0] * 51, look(ring(), 50)
+    assert window_factor(seen, poses, scales, lambda row: row >= 44, graph.noise, (40, np.inf)).b == 44
+    assert window_factor(seen, poses, scales, lambda row: row == 0, graph.noise, (40, np.inf)) is None
+    assert window_factor(seen, poses, scales, lambda row: row == 0, graph.noise, (50, np.inf)).b == 0
+    seen.T_anchor_views[40][:] = np.nan
+    assert window_factor(seen, poses, scales, anywhere, graph.noise, (40, np.inf)).b == 41, "the prior knows no 40"
+    off = list(ring(1.9 * np.pi)[:51])
+    misfit = chi2(window_factor(seen, off, scales, anywhere, graph.noise, (40, np.inf)), off, scales)
+    assert misfit > 0.1
+    for share, is_kept in ((0.99, False), (1.01, True)):
+        edge = window_factor(seen, off, scales, anywhere, graph.noise, (40, share * misfit))
+        assert (edge is not None) == is_kept
+    seen.T_anchor_views[50][:] = np.nan
+    assert window_factor(seen, poses, scales, anywhere, graph.noise, (40, np.inf)) is None, "it is not known itself"
+
+
+@pytest.mark.parametrize(("origin", "count"), [(None, 1), (49, 2), (10, 2), (9, 3)])
+def test_only_a_frame_that_comes_back_has_a_window_factor(graph, origin, count):
+    """The visit before ends 40 nodes before it, as in the deformation of the map."""
+    poses, before = ring(), BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
+    for index in range(50):
+        before = add_node(before, look(poses, index), poses[index], 1.0, None)
+    after = add_node(before, look(poses, 50), poses[50], 1.0, origin)
+    assert len(after.factors) - len(before.factors) == count
+
+
+def test_a_path_that_repeats_the_errors_of_an_earlier_visit_gains_by_what_its_windows_say(graph):
+    """Both laps are estimated alike, too fast at first and too slow then; a loop that fits moves nothing by itself."""
+    lap, end = COUNT - 1, BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
+    angles = 2 * np.pi * np.arange(2 * lap) / lap
+    truth, placed = on_ring(angles), on_ring(angles + 0.015 * np.sin(angles))
+    for index, pose in enumerate(placed):
+        views = {row: truth[row] for row in range(max(index - WINDOW, 0), index + 1)}
+        seen = replace(look(ring(), 0, index), T_anchor_views=views)
+        end = add_node(end, seen, pose, 1.0, index - lap if index >= lap else max(index - 1, 0))
+    without = replace(end, factors=[one for one in end.factors if one.a - one.b != WINDOW])
+    assert len(end.factors) - len(without.factors) == lap
+    closing = LoopMeasurement(0, lap, np.eye(4), 0.0, np.diag([100.0] * 3 + [200.0] * 3 + [0.0]), 50)
+
+    def farthest(end: BackEnd) -> float:
+        solved, _ = close_loops(end, state_of(placed[:COUNT]), [closing])
+        return float(np.linalg.norm(np.stack(solved.poses)[:, :3, 3] - truth[:, :3, 3], axis=1).max())
+
+    assert farthest(without) == pytest.approx(0.03, rel=0.01) and farthest(end) < 0.8 * 0.03
 
 
 def test_without_a_loop_nothing_moves_however_the_predictions_differ(graph):
