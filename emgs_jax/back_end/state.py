@@ -62,7 +62,7 @@ class Node:
         covariance: (6, 6) of `online`, see `FrameRecord`; None without one, or in a saved map, which counts as exact.
         origin: node whose Gaussians it was registered to; None if it was not registered.
         depth_noise: difference of its points from the map, as a fraction of their depth; None if it was not registered.
-        predicted: T_anchor_camera (4, 4) as the prior predicted it; None without one.
+        predicted: T_anchor_camera (4, 4) as the prior predicted it; None without one, or in a saved map.
     """
 
     pose: np.ndarray

@@ -73,7 +73,7 @@ def rewritten(folder, **changes):
 def test_what_is_read_is_what_was_written(end, graph, folder):
     read, depth_noise = load_places(folder / "places.npz", BackEnd(graph, CAMERA, 0.01))
     assert depth_noise == 0.01
-    unsaved = {"online": None, "origin": None}
+    unsaved = {"online": None, "origin": None, "predicted": None}
     _same(*([replace(node, **unsaved) for node in one.nodes] for one in (read, end)))
     for name in ("factors", "verified", "violating", "accepted"):
         _same(getattr(read, name), getattr(end, name))
