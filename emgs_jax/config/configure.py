@@ -260,7 +260,8 @@ def structure_config(config: DictConfig) -> "StructureConfig":
 
 def build_prior(config: DictConfig, dataset: ReadableFrames) -> Prior:
     """Build the prior of a config; ValueError if it cannot predict for the data set."""
-    if "metres" not in config.prior and any(value is not None for name, value in config.get("scale", {}).items() if name != "_target_"):
+    given = [name for name, value in config.get("scale", {}).items() if value is not None and name != "_target_"]
+    if given and "metres" not in config.prior:
         raise ValueError(
             "scale= gives metres to prior=multiview_stereo, whose unit is unknown; this prior has one of its own "
             "(emgs export RUN scale=FACTOR writes copies of a finished run in another unit)"

@@ -20,6 +20,7 @@ from emgs_jax.io.npz import read_npz
 from emgs_jax.live.newest import Newest, Shot
 
 # Streams over TCP, each image as it comes: otherwise OpenCV lags by seconds (opencv#13145).
+OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 RTSP_OPTIONS = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
 GIVEN = ("depth", "T_world_camera", "intrinsics", "confidence")  # arrays beside an image, as in files of prior=files
 
@@ -62,9 +63,7 @@ def open_source(source: str, into: Newest) -> Iterator[Shot]:
     if path.is_dir() or is_video:
         into.can_wait = True
         return _paced(_of_video(Video(path)) if is_video else _recorded(path), into.begun)
-    if "://" in source:
-        os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", RTSP_OPTIONS)
-    capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+    capture = _stream(source) if "://" in source else cv2.VideoCapture(int(source) if source.isdecimal() else source)
     if not capture.isOpened():
         devices = ", ".join(str(device) for device in sorted(Path("/dev").glob("video*"))) or "none"
         raise ValueError(
@@ -73,6 +72,17 @@ def open_source(source: str, into: Newest) -> Iterator[Shot]:
         )
     capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
     return _of_device(capture)
+
+
+def _stream(address: str) -> cv2.VideoCapture:
+    """Open a stream without a buffer, as its options alone are: a video loses its first frame by them."""
+    if OPTIONS in os.environ:  # a user's own
+        return cv2.VideoCapture(address)
+    os.environ[OPTIONS] = RTSP_OPTIONS
+    try:
+        return cv2.VideoCapture(address)
+    finally:
+        del os.environ[OPTIONS]
 
 
 def _of_device(capture: cv2.VideoCapture) -> Iterator[Shot]:

@@ -175,7 +175,8 @@ def test_what_the_last_frames_saw_move_is_taken_out_of_the_map_and_written_into_
     found = SimpleNamespace(submap=0)
     monkeypatch.setattr(integrate, "place", lambda atlas, window: (atlas, Event(np.eye(4)[None]), found))
     monkeypatch.setattr(integrate, "update_graph", lambda atlas, *_: atlas)
-    atlas, event = integrate.integrate(apart.atlas, SimpleNamespace(seconds={}, adjusted={}))  # a frame of 1 is found in 0
+    window = SimpleNamespace(seconds={}, adjusted={})  # a frame of 1 is found in 0
+    atlas, event = integrate.integrate(apart.atlas, window)
     np.testing.assert_allclose(atlas.submaps[0].state.map.existence, expected, rtol=1e-6)
     assert sorted(int(seen.time) for seen in event.seen) == [4, 5] and atlas.submaps[0].state.looks is None
 

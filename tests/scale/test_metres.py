@@ -4,8 +4,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from scene import compose
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.config.configure import build, build_dataset, build_prior
 from emgs_jax.scale.metres import ScaleConfig, View, metres_of
 
 UNIT, HEIGHT, FOCAL, SIZE = 0.4, 1.5, 60.0, (80, 60)  # units of a metre; metres
@@ -168,3 +170,14 @@ def test_an_extrinsic_that_is_no_rigid_motion_is_named(tmp_path):
     path.write_text("\n".join(f"{0.005 * row} 0 0 0 0 0 9.81" for row in range(4000)))
     with pytest.raises(ValueError, match=r"scale.T_imu_camera must be the 16 numbers"):
         measured(tmp_path, ScaleConfig(imu=str(path), T_imu_camera=[1.0] * 16))
+
+
+def test_a_prior_with_a_unit_of_its_own_takes_no_scale_and_one_from_images_alone_does():
+    config = compose("prior=simulated", "scale.height=1.5")
+    with pytest.raises(ValueError, match="scale= gives metres to prior=multiview_stereo, whose unit is unknown"):
+        build_prior(config, build_dataset(config))
+    given = build(compose("prior=multiview_stereo", "scale.distance=[a.jpg,1,2,3,4,1.5]"), "prior")
+    assert given.provenance.settings["unit"] == "m" and "a.jpg" in str(given.provenance.settings["scale"])
+    assert "unit" not in build(compose("prior=multiview_stereo"), "prior").provenance.settings
+    with pytest.raises(ValueError, match="online=true makes poses as images come, and scale= needs all of them"):
+        build(compose("prior=multiview_stereo", "prior.structure.online=true", "scale.height=1.5"), "prior")
