@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from hydra.errors import InstantiationException
 from scene import compose
 from scipy.spatial.transform import Rotation
 
@@ -179,5 +180,7 @@ def test_a_prior_with_a_unit_of_its_own_takes_no_scale_and_one_from_images_alone
     given = build(compose("prior=multiview_stereo", "scale.distance=[a.jpg,1,2,3,4,1.5]"), "prior")
     assert given.provenance.settings["unit"] == "m" and "a.jpg" in str(given.provenance.settings["scale"])
     assert "unit" not in build(compose("prior=multiview_stereo"), "prior").provenance.settings
-    with pytest.raises(ValueError, match="online=true makes poses as images come, and scale= needs all of them"):
+    with pytest.raises(
+        InstantiationException, match="online=true makes poses as images come, and scale= needs all of them"
+    ):
         build(compose("prior=multiview_stereo", "prior.structure.online=true", "scale.height=1.5"), "prior")
