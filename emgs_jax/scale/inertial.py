@@ -73,8 +73,11 @@ def read_inertial(path: Path) -> Inertial:
     """Read time, three rates and three accelerations a line, with commas or spaces, such as EuRoC's imu0/data.csv.
 
     Raises:
-        ValueError: a line has other numbers, times do not ascend, or accelerations are without gravity.
+        ValueError: there is no such file, a line has other numbers, times do not ascend, or accelerations are without
+            gravity.
     """
+    if not path.is_file():
+        raise ValueError(f"scale.imu={path} is no file: give one with time, rates and accelerations a line")
     rows = []
     for number, line, words in words_of(path):
         values = numbers_in(words[:7])

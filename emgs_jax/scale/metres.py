@@ -146,8 +146,9 @@ def _of_world(
             notes.append(f"{placed.num_used} positions fit within {placed.residual:.2g} m")
     if config.imu is not None:
         times = np.array([dataset[int(frame)].timestamp for frame in frames])
+        measured, T_imu_camera = read_inertial(Path(config.imu).expanduser()), _mounted(config)
         try:
-            motion = scale_of_motion(times, poses, read_inertial(Path(config.imu)), _mounted(config), "imu")
+            motion = scale_of_motion(times, poses, measured, T_imu_camera, "imu")
         except ValueError as error:
             notes.append(str(error))
         else:

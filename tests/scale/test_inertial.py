@@ -108,3 +108,5 @@ def test_tables_of_something_else_are_named(tmp_path, row, message):
     path.write_text("time wx wy wz ax ay az\n" + "\n".join(row.format(t=0.01 * index) for index in range(20)))
     with pytest.raises(ValueError, match=message):
         read_inertial(path)
+    with pytest.raises(ValueError, match="scale.imu=.* is no file"):
+        read_inertial(tmp_path / "none.csv")

@@ -152,6 +152,16 @@ def test_no_floor_is_said(tmp_path):
         )
 
 
+def test_a_file_that_is_not_there_ends_a_run_whatever_else_is_known(tmp_path):
+    """A source that says nothing of a walk is a note; one that cannot be read is an error."""
+    with pytest.raises(ValueError, match="imu=.* is no file"):
+        measured(tmp_path, ScaleConfig(height=HEIGHT, imu=str(tmp_path / "none.csv"), T_imu_camera=np.eye(4).ravel()))
+    path = tmp_path / "imu.csv"
+    path.write_text("\n".join(f"{100 + 0.005 * row} 0 0 0 0 0 9.81" for row in range(400)))
+    (found,) = measured(tmp_path, ScaleConfig(height=HEIGHT, imu=str(path), T_imu_camera=np.eye(4).ravel()))
+    assert found.scale is not None and any("by the clock of the images" in note for note in found.notes)
+
+
 @pytest.mark.parametrize(
     ("given", "message"),
     [
