@@ -57,6 +57,12 @@ def test_scale_gravity_and_biases_are_found():
     assert motion.accelerometer_bias == pytest.approx(BIASES[1], abs=0.08)
 
 
+def test_a_noisier_path_is_less_sure_of_scale_and_up():
+    clean, noisy = (scale_of_motion(*walk(noise=noise)[:3], T_IMU_CAMERA, "imu") for noise in (0.0, 0.03))
+    assert 1e-4 < clean.scale.std < 1e-3 and 1e-3 < noisy.scale.std < 0.01
+    assert 0.1 < clean.up_std_deg < 0.4 < noisy.up_std_deg < 1.0
+
+
 def test_the_arm_from_the_camera_counts():
     times, poses, measured, *_ = walk(errors=False)
     without = T_IMU_CAMERA.copy()
