@@ -1,6 +1,6 @@
 """Factors of the pose graph that a frame adds: its pose relative to earlier frames, and to the map."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -102,16 +102,13 @@ def sequential_factor(
         is_connected: tells whether a factor may join a node: its pose is an estimate, not a placeholder.
     """
     time = len(poses) - 1
-    known = {index for index, pose in frame.T_anchor_views.items() if np.isfinite(pose).all()}
-    nearest = sorted(frame.index - index for index in known)
-    offset = next((offset for offset in nearest if 0 < offset <= time and is_connected(time - offset)), None)
-    if frame.index not in known or offset is None:
+    offset = next(_offsets(frame, time, is_connected), None)
+    if offset is None:
         return None
     row, spread = time - offset, np.sqrt(offset)
     weights = _weights(frame, noise, spread * noise.pair, spread * noise.log_scale)
-    return Factor(
-        time, row, _relative_pose(poses, log_scales, row), log_scales[row] - log_scales[time], weights, is_loop=False
-    )
+    measured = _relative_pose(poses, log_scales, time, row)
+    return Factor(time, row, measured, log_scales[row] - log_scales[time], weights, is_loop=False)
 
 
 def window_factor(
@@ -137,23 +134,27 @@ def window_factor(
         The factor; None without one within the limits.
     """
     time, (max_gap, max_chi2) = len(poses) - 1, limits
-    known = {index: pose for index, pose in frame.T_anchor_views.items() if np.isfinite(pose).all()}
-    farthest = sorted((frame.index - index for index in known), reverse=True)
-    reach = min(time, max_gap)
-    offset = next((offset for offset in farthest if 0 < offset <= reach and is_connected(time - offset)), None)
-    if frame.index not in known or offset is None:
+    offset = max((offset for offset in _offsets(frame, time, is_connected) if offset <= max_gap), default=None)
+    if offset is None:
         return None
-    measured = np.linalg.inv(known[frame.index]) @ known[frame.index - offset]
+    measured = np.linalg.inv(frame.T_anchor_views[frame.index]) @ frame.T_anchor_views[frame.index - offset]
     weights = _weights(frame, noise, np.sqrt(offset) * noise.pair)
     factor = Factor(time, time - offset, measured, 0.0, weights, is_loop=False)
     return factor if chi2(factor, poses, log_scales) <= max_chi2 else None
 
 
+def _offsets(frame: FrameData, time: int, is_connected: Callable[[int], bool]) -> Iterator[int]:
+    """Yield how many frames before the last one its views are whose nodes a factor may join, the nearest first."""
+    known = {index for index, pose in frame.T_anchor_views.items() if np.isfinite(pose).all()}
+    for offset in sorted(frame.index - index for index in known if frame.index in known):
+        if 0 < offset <= time and is_connected(time - offset):
+            yield offset
+
+
 def chi2(measured: Factor | LoopMeasurement, poses: Sequence[np.ndarray], log_scales: Sequence[float]) -> float:
     """Compute χ² of a measurement at the poses and scales of all nodes."""
     a, b = measured.a, measured.b
-    now = scale_pose(np.linalg.inv(poses[a]) @ poses[b], np.exp(-log_scales[a]))
-    error = np.linalg.inv(measured.Z_a_b) @ now
+    error = np.linalg.inv(measured.Z_a_b) @ _relative_pose(poses, log_scales, a, b)
     turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
     residual = [*error[:3, 3], *turn, log_scales[b] - log_scales[a] - measured.log_ratio]
     return float(np.sum((measured.sqrt_info @ residual) ** 2))
@@ -163,19 +164,18 @@ def map_factor(
     frame: FrameData, poses: Sequence[np.ndarray], log_scales: Sequence[float], origin: int, noise: NoiseConfig
 ) -> Factor:
     """Build the map factor: the last frame's pose relative to frame `origin`, whose Gaussians it was registered to."""
-    measured = _relative_pose(poses, log_scales, origin)
+    measured = _relative_pose(poses, log_scales, -1, origin)
     return Factor(len(poses) - 1, origin, measured, 0.0, _weights(frame, noise, noise.map), is_loop=False)
-
-
-def _relative_pose(poses: Sequence[np.ndarray], log_scales: Sequence[float], row: int) -> np.ndarray:
-    """Compute the pose of node `row` relative to the last one, in the unit of the last one's inference."""
-    return scale_pose(np.linalg.inv(poses[-1]) @ poses[row], np.exp(-log_scales[-1]))
 
 
 def measured_again(factor: Factor, poses: Sequence[np.ndarray], log_scales: Sequence[float]) -> Factor:
     """Return a factor, other than of a loop, with the relative pose that two nodes have now."""
-    Z_a_b = scale_pose(np.linalg.inv(poses[factor.a]) @ poses[factor.b], np.exp(-log_scales[factor.a]))
-    return factor if factor.is_loop else factor._replace(Z_a_b=Z_a_b)
+    return factor if factor.is_loop else factor._replace(Z_a_b=_relative_pose(poses, log_scales, factor.a, factor.b))
+
+
+def _relative_pose(poses: Sequence[np.ndarray], log_scales: Sequence[float], a: int, b: int) -> np.ndarray:
+    """Compute the pose of node b relative to node a, in the unit of a's inference."""
+    return scale_pose(np.linalg.inv(poses[a]) @ poses[b], np.exp(-log_scales[a]))
 
 
 def loop_factor(loop: LoopMeasurement) -> Factor:

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float, Int
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.data.euroc import read_sensor
@@ -67,9 +67,8 @@ class ScaleConfig:
 class View(NamedTuple):
     """What a frame shows."""
 
-    points: Float[np.ndarray, "h w 3"]  # in the camera's axes, the structure's unit
+    points: Float[np.ndarray, "h w 3"]  # in the camera's axes, the structure's unit; 0 where there is none
     std: Float[np.ndarray, "h w"]  # of the logarithm of each depth
-    mask: Bool[np.ndarray, "h w"]  # where points are known
 
 
 class Metres(NamedTuple):
@@ -121,7 +120,7 @@ def _of_world(
         if frame not in frames:
             notes.append(f"image {image} of scale.distance has no pose in this model")
             continue
-        ends = [point_at(*_known(view(frame)), dataset.pixel_of(frame, np.array(pixels[k : k + 2]))) for k in (0, 2)]
+        ends = [point_at(*view(frame), dataset.pixel_of(frame, np.array(pixels[k : k + 2]))) for k in (0, 2)]
         if None in ends:
             unknown = pixels[:2] if ends[0] is None else pixels[2:]
             raise ValueError(
@@ -161,10 +160,6 @@ def _of_world(
     return Metres(scale, up, tuple(filter(None, [warning, *notes])))
 
 
-def _known(view: View) -> tuple[np.ndarray, np.ndarray]:
-    return np.where(view.mask[..., None], view.points, 0.0), view.std
-
-
 def _frame_of(image: str, names: Sequence[str]) -> int:
     """The frame of an image's name, with or without suffix, or of its number in a video."""
     for name in (image, stem(image), image.zfill(6)):
@@ -188,7 +183,7 @@ def _by_floor(
     rows = np.unique(np.linspace(0, len(frames) - 1, min(NUM_VIEWS, len(frames))).round().astype(int))
     each = []
     for row in rows:
-        points, _ = _known(view(int(frames[row])))
+        points = view(int(frames[row])).points
         step = max(round(max(points.shape[:2]) / PIXELS), 1)
         each.append(surfaces_of(points, poses[row], step))
     surfaces = Surfaces(*(np.concatenate(part) for part in zip(*each, strict=True)))

@@ -66,7 +66,7 @@ def view(frame):
     down = -(rays @ T[:3, :3].T)[..., 2]
     z = np.where(down > 0.1, T[2, 3] / np.maximum(down, 0.1), 0.0)
     mask = (z > 0) & (z < 5)
-    return View(UNIT * np.where(mask, z, 0.0)[..., None] * rays, np.full(z.shape, 0.02), mask)
+    return View(UNIT * np.where(mask, z, 0.0)[..., None] * rays, np.full(z.shape, 0.02))
 
 
 def on_floor(frame, pixel):

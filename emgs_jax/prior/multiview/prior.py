@@ -190,8 +190,8 @@ class MultiviewStereo(Prior):
         """Bring structure and depths into metres by the lengths that are known; other worlds keep their unit."""
 
         def view(frame: int) -> View:
-            points, confidence, mask = self._answer(frame)
-            return View(points, 1.0 / confidence, mask)
+            points, confidence, _ = self._answer(frame)
+            return View(points, 1.0 / confidence)
 
         each, depths = metres_of(self._metres, self._dataset, found.T_world_camera, found.world, view), self._depths
         factors = np.ones(len(each))
