@@ -10,11 +10,11 @@ from jaxtyping import Float, Int
 
 from emgs_jax.data.base import Dataset
 from emgs_jax.data.euroc import read_sensor
-from emgs_jax.data.masks import files_of, image_names, stem
+from emgs_jax.data.masks import files_of, names_of, stem
 from emgs_jax.ops.ranges import number
 from emgs_jax.scale.estimate import Scale, combined, scale_from
 from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_level, surfaces_of
-from emgs_jax.scale.inertial import read_inertial, scale_of_motion
+from emgs_jax.scale.inertial import Inertial, read_inertial, scale_of_motion
 from emgs_jax.scale.positions import positions_of_exif, read_positions, scale_of_positions
 from emgs_jax.scale.tape import point_at, scale_of_distance
 from emgs_jax.scale.up import up_of_cameras, up_of_surfaces
@@ -96,18 +96,35 @@ def metres_of(
     Raises:
         ValueError: a source cannot be read, or says nothing of any world.
     """
-    names = image_names(*files_of(dataset))
+    names, read = names_of(dataset), _read(config, dataset)
     found = [
-        _of_world(config, dataset, poses, np.flatnonzero(world == one), names, view) for one in range(max(world) + 1)
+        _of_world(config, dataset, read, poses, np.flatnonzero(world == one), names, view)
+        for one in range(max(world) + 1)
     ]
     if all(one.scale is None for one in found):
         raise ValueError("scale: " + "; ".join(note for one in found for note in one.notes))
     return found
 
 
+class Read(NamedTuple):
+    """What the files of the sources hold; None for those that are not given."""
+
+    positions: Float[np.ndarray, "n 3"] | None  # of all frames
+    inertial: Inertial | None
+    T_imu_camera: Float[np.ndarray, "4 4"] | None
+
+
+def _read(config: ScaleConfig, dataset: Dataset) -> Read:
+    positions = None if config.positions is None else _positions(config.positions, dataset)
+    if config.imu is None:
+        return Read(positions, None, None)
+    return Read(positions, read_inertial(Path(config.imu).expanduser()), _mounted(config))
+
+
 def _of_world(
     config: ScaleConfig,
     dataset: Dataset,
+    read: Read,
     all_poses: Float[np.ndarray, "n 4 4"],
     frames: Int[np.ndarray, " k"],
     names: Sequence[str],
@@ -133,21 +150,19 @@ def _of_world(
         up, scale = _by_floor(config.height, frames, poses, view, focal, up)
         scales += [] if scale is None else [scale]
         notes += ["no floor was found below the cameras"] if scale is None else []
-    if config.positions is not None:
-        positions = _positions(config.positions, dataset, names)[frames]
+    if read.positions is not None:
         try:
-            placed = scale_of_positions(poses[:, :3, 3], positions, "positions")
+            placed = scale_of_positions(poses[:, :3, 3], read.positions[frames], "positions")
         except ValueError as error:
             notes.append(str(error))
         else:
             scales.append(placed.scale)
             up = placed.T_metres_world.rotation.T @ np.array([0.0, 0.0, 1.0])
             notes.append(f"{placed.num_used} positions fit within {placed.residual:.2g} m")
-    if config.imu is not None:
+    if read.inertial is not None:
         times = np.array([dataset[int(frame)].timestamp for frame in frames])
-        measured, T_imu_camera = read_inertial(Path(config.imu).expanduser()), _mounted(config)
         try:
-            motion = scale_of_motion(times, poses, measured, T_imu_camera, "imu")
+            motion = scale_of_motion(times, poses, read.inertial, read.T_imu_camera, "imu")
         except ValueError as error:
             notes.append(str(error))
         else:
@@ -197,10 +212,11 @@ def _by_floor(
     return up, scale_from("height", height, middle, np.hypot(spread / len(heights) ** 0.5, MIN_STD))
 
 
-def _positions(given: str, dataset: Dataset, names: Sequence[str]) -> Float[np.ndarray, "n 3"]:
+def _positions(given: str, dataset: Dataset) -> Float[np.ndarray, "n 3"]:
     if given == "exif":
         return positions_of_exif(files_of(dataset)[0])
-    return read_positions(Path(given).expanduser(), names, [dataset[index].timestamp for index in range(len(dataset))])
+    times = [dataset[index].timestamp for index in range(len(dataset))]
+    return read_positions(Path(given).expanduser(), names_of(dataset), times)
 
 
 def _mounted(config: ScaleConfig) -> Float[np.ndarray, "4 4"]:
