@@ -52,8 +52,8 @@ existence: all is seen from the world's origin
   - gaussians.means - origins
   + gaussians.means
 back_end/factors: edges the other way round (back_end/test_back_end)
-  - np.linalg.inv(poses[-1]) @ poses[row]
-  + np.linalg.inv(poses[row]) @ poses[-1]
+  - np.linalg.inv(poses[a]) @ poses[b], np.exp(-log_scales[a])
+  + np.linalg.inv(poses[b]) @ poses[a], np.exp(-log_scales[a])
 mapping/atlas: the unit of a place is that of the map after it has moved (mapping/test_covariance_of_map)
   - scale_covariance(place.covariance, 1.0 / unit)
   + scale_covariance(place.covariance, 1.0 / scale)
