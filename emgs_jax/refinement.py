@@ -157,6 +157,12 @@ def average_candidates(
     return where_rows(sums > 0, averaged, old)
 
 
+def without_scattered(candidates: Gaussians, splats: Splats, config: RefinementConfig) -> Gaussians:
+    """Invalidate candidates whose splats are wider than `max_splat_std`, as those of scattered points are."""
+    widest = jnp.sqrt(jnp.trace(splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale)
+    return eqx.tree_at(lambda g: g.valid, candidates, candidates.valid & ~(widest > config.max_splat_std))
+
+
 @full_precision
 def refine(
     submap: GaussianMap,
@@ -184,9 +190,7 @@ def refine(
     map_splats, candidate_splats = (splats_of(g, T_world_camera, camera, config.render) for g in (old, candidates))
     rendering = render_splats(map_splats, old.colors, camera, config.render)
 
-    widest = jnp.sqrt(jnp.trace(candidate_splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale)
-    is_surface = candidates.valid & (widest <= config.max_splat_std)
-    candidates = eqx.tree_at(lambda g: g.valid, candidates, is_surface)
+    candidates = without_scattered(candidates, candidate_splats, config)
     map_depth = depth_at(rendering, candidate_splats, camera)
     # Match only visible Gaussians: one behind the rendered surface is occluded.
     own_depth = depth_at(rendering, map_splats, camera)

@@ -50,10 +50,11 @@ from emgs_jax.ops.executable import executable
 from emgs_jax.ops.neighbours import group_points, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import static, static_choice, take_rows
-from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine
+from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine, without_scattered
 from emgs_jax.registration.depth_field import moved_by_field
 from emgs_jax.registration.pose_estimate import PoseEstimate, exact_estimate
 from emgs_jax.registration.rigid import median, pose_row
+from emgs_jax.render.composite import splats_of
 from emgs_jax.splitting import SplittingConfig, split
 from emgs_jax.surface_extrapolation import ExtrapolationConfig, extrapolate
 
@@ -271,6 +272,8 @@ def _first_state(
     view: Camera,
     config: SlamConfig,
 ) -> tuple[SlamState, Int[Array, ""]]:
+    splats = splats_of(gaussians, pose_row(sound_poses(T_world_views), -1), view, config.refinement.render)
+    gaussians = without_scattered(gaussians, splats, config.refinement)
     # The second frame has nothing else to align with, so the first window confirms itself.
     existence = jnp.maximum(config.existence.birth, config.existence.hit)
     time = jnp.asarray(world.valid.shape[0], jnp.int32)

@@ -1,4 +1,4 @@
-"""Two maps of one wall become one layer half way between them; what only one of them shows stays as it is."""
+"""Two maps of one wall become one layer half way between them, two sheets of a wall one sheet; all else stays."""
 
 import equinox as eqx
 import numpy as np
@@ -6,9 +6,9 @@ import pytest
 from scene import device, flat_gaussians, fresh_map, join, on_host
 
 from emgs_jax.gaussian_map import GaussianMap
-from emgs_jax.layers import one_layer
+from emgs_jax.layers import fuse_sheets, one_layer
 
-made_one = on_host(one_layer)
+made_one, of_one_sheet = on_host(one_layer), on_host(fuse_sheets)
 GRID = np.arange(-1.0, 1.01, 0.1)
 FIRST = np.array([(x, y, 3.0) for x in GRID for y in GRID])
 GAP, BEYOND = 0.04, 0.6  # m; the other wall is so far behind the first, and goes on so far beside it
@@ -113,3 +113,70 @@ def test_maps_of_fewer_gaussians_than_a_mean_is_over_become_one_too(config, coun
     one = after(config, map, is_other)
     np.testing.assert_array_equal(one.gaussians.valid, ~is_other)
     np.testing.assert_allclose(np.asarray(one.gaussians.means)[:count, 2], 3.0 + GAP / 2, atol=1e-6)
+
+
+FRONT = np.zeros(3)  # the camera that saw the nearer wall at z = 3
+DESK, BOOK = FIRST + [0, 0, GAP], FIRST[np.abs(FIRST[:, :2]).max(axis=1) < 0.45]
+
+
+def sheets(config, parts, weights, cameras=(FRONT, FRONT), noise=0.02, words=(), normal=NORMAL):
+    """Walls with the weight of each, seen by the camera of each, before and after `fuse_sheets`."""
+    map, is_other = walls(*parts, normal=normal)
+    map = eqx.tree_at(lambda m: m.weight, map, device(np.where(is_other, weights[1], weights[0]).astype(float)))
+    origins = device(np.where(is_other[:, None], cameras[1], cameras[0]))
+    return map, of_one_sheet(map, origins, device(noise), config(*words).existence), is_other
+
+
+@pytest.mark.parametrize("weights", [(9.0, 1.0), (1.0, 9.0)])
+def test_two_sheets_of_a_wall_become_that_of_more_frames_moved_by_the_share_of_the_other(config, weights):
+    map, one, is_other = sheets(config, (FIRST, DESK), weights)
+    is_light = is_other == (weights[0] > weights[1])
+    np.testing.assert_array_equal(one.gaussians.valid, ~is_light)
+    z = np.asarray(one.gaussians.means)[~is_light, 2]
+    mean = np.average([3.0, 3.0 + GAP], weights=weights)
+    np.testing.assert_allclose(np.median(z), mean, atol=2e-3)
+    np.testing.assert_allclose(one.weight[~is_light].sum(), map.weight.sum(), rtol=1e-6)
+    np.testing.assert_allclose(one.gaussians.covs[~is_light][:, 2, 2], map.gaussians.covs[0, 2, 2], rtol=1e-3)
+
+
+def test_a_book_and_the_desk_that_no_frame_saw_through_it_stay(config):
+    """Seen from above at a slant, where the desk's Gaussians end at the shadow of the book."""
+    above = np.array([-2.0, 0.0, 0.0])
+    rays = DESK - above
+    shadow = above + rays * (3.0 / DESK[:, 2:])
+    beside = DESK[np.abs(shadow[:, :2]).max(axis=1) > 0.5]
+    map, one, _ = sheets(config, (BOOK, beside), (9.0, 1.0), (above, above))
+    assert np.asarray(one.gaussians.valid).all()
+    np.testing.assert_array_equal(one.gaussians.means, map.gaussians.means)
+
+
+def test_a_desk_that_was_seen_before_the_book_lay_on_it_is_taken_for_a_sheet_of_the_book(config):
+    """What distinguishes them from sheets is that no frame sees one through the other; here one did."""
+    _, one, is_other = sheets(config, (BOOK, DESK), (9.0, 1.0))
+    under = is_other & (np.abs(np.concatenate([BOOK, DESK])[:, :2]).max(axis=1) < 0.35)
+    valid = np.asarray(one.gaussians.valid)
+    assert valid[~is_other].all() and not valid[under].any()
+
+
+@pytest.mark.parametrize(
+    ("parts", "cameras", "noise", "words"),
+    [
+        ((FIRST, DESK), (FRONT, FRONT), 0.002, ()),  # frames are sure to .6 cm: 4 cm are another wall
+        ((FIRST, DESK), (FRONT, np.array([0, 0, 3.0 + GAP / 2])), 0.02, ()),  # from between them
+        ((FIRST, FIRST + [0, 0, 0.005]), (FRONT, FRONT), 0.02, ()),  # one thick sheet
+        ((FIRST, DESK), (FRONT, FRONT), 0.02, ("slam/existence=paper",)),
+    ],
+)
+def test_what_is_no_second_sheet_stays(config, parts, cameras, noise, words):
+    map, one, _ = sheets(config, parts, (9.0, 1.0), cameras, noise, words)
+    assert np.asarray(one.gaussians.valid).all()
+    np.testing.assert_array_equal(one.gaussians.means, map.gaussians.means)
+
+
+def test_the_other_side_and_another_thing_are_no_second_sheet(config):
+    for change in ("normals", "features"):
+        map, is_other = walls(FIRST, DESK)
+        values = np.array({"normals": [NORMAL, (0.0, 0.0, 1.0)], "features": [(1.0, 0.0), (-1.0, 0.2)]}[change])
+        map = eqx.tree_at(lambda m: getattr(m.gaussians, change), map, device(values[is_other.astype(int)]))  # noqa: B023
+        one = of_one_sheet(map, device(np.zeros((len(is_other), 3))), device(0.02), config().existence)
+        assert np.asarray(one.gaussians.valid).all(), change

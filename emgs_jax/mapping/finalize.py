@@ -13,6 +13,7 @@ import jaxlie
 import numpy as np
 from jaxtyping import Array, Float
 
+from emgs_jax.back_end.optimization import fuse_sheets_of_state
 from emgs_jax.back_end.state import BackEnd, transform_nodes
 from emgs_jax.device.arrays import on_device
 from emgs_jax.existence import ExistenceConfig, Seen, take_back
@@ -61,6 +62,14 @@ def _end_looks(state: SlamState, view: Camera, config: ExistenceConfig) -> tuple
         return take_back(map, seen, view, config), seen
 
     return jax.lax.scan(end, state.map, state.looks, reverse=True)
+
+
+def with_sheets_fused(atlas: Atlas) -> Atlas:
+    """Apply `fuse_sheets` to the map of a run that ends; submaps apart stay, and so does a frozen map."""
+    if atlas.state is None:
+        return atlas
+    state = fuse_sheets_of_state(atlas.state, atlas.graph, atlas.config.existence)
+    return with_state(atlas, state, atlas.config)
 
 
 def own_covariance(state: SlamState, config: LocalizationConfig) -> np.ndarray:

@@ -13,7 +13,7 @@ from emgs_jax.mapping.capacity import prepare_step
 from emgs_jax.mapping.checkpoint import Keeper
 from emgs_jax.mapping.convert import FirstWindow
 from emgs_jax.mapping.event import Event
-from emgs_jax.mapping.finalize import end_looks_of, rescale_atlas, with_first_frame
+from emgs_jax.mapping.finalize import end_looks_of, rescale_atlas, with_first_frame, with_sheets_fused
 from emgs_jax.mapping.integrate import finish_back_end, integrate, seconds_of
 from emgs_jax.mapping.records import FrameRecord, records_of, with_moved_nodes, with_moved_pixels, with_unjoined_apart
 from emgs_jax.mapping.run import MappingRun
@@ -119,6 +119,8 @@ def finish_run(run: MappingRun, is_interrupted: bool = False) -> MappingRun:
             run = with_atlas(run, finish_back_end(run.atlas, run.prior_query))
     if not run.records:
         return run
+    if not is_interrupted:
+        run = with_atlas(run, with_sheets_fused(run.atlas))
     first = next((record.pose for record in run.records if record.submap is None), run.records[0].pose)
     atlas, own = with_first_frame(run.atlas, first)
     return replace(with_atlas(run, rescale_atlas(atlas, first)), first_covariance=own)

@@ -11,7 +11,7 @@ import jaxlie
 import numpy as np
 import pytest
 from hand_run import run_of
-from scene import flat_gaussians, pose, random_gaussians, random_observation, slam_config
+from scene import flat_gaussians, fresh_map, pose, random_gaussians, random_observation, slam_config
 
 from emgs_jax.gaussian_map import new_map
 from emgs_jax.io.run_lengths import from_run_lengths, to_run_lengths
@@ -179,6 +179,26 @@ def test_what_the_last_frames_saw_move_is_taken_out_of_the_map_and_written_into_
     atlas, event = integrate.integrate(apart.atlas, window)
     np.testing.assert_allclose(atlas.submaps[0].state.map.existence, expected, rtol=1e-6)
     assert sorted(int(seen.time) for seen in event.seen) == [4, 5] and atlas.submaps[0].state.looks is None
+
+
+@pytest.mark.parametrize("stays", [None, "frozen", "interrupted", "paper", "no noise"])
+def test_two_sheets_of_a_wall_are_one_when_a_run_ends(stays):
+    """The first frame's wall is 4 cm behind the second's, which more frames have seen."""
+    grid = np.stack(np.meshgrid(np.arange(-1, 1.01, 0.1), np.arange(-1, 1.01, 0.1)), axis=-1).reshape(-1, 2)
+    walls = [np.column_stack([grid, np.full(len(grid), z)]) for z in (3.04, 3.0)]
+    gaussians = flat_gaussians(np.concatenate(walls), 0.05, (0.0, 0.0, -1.0), 0.003)
+    is_second = np.repeat([False, True], len(grid))
+    map = fresh_map(gaussians, np.where(is_second, 9.0, 1.0), 1.0, is_second)
+    config = slam_config(f"slam/existence={'paper' if stays == 'paper' else 'default'}")
+    records = [FrameRecord(i, None, None, "tracked", pose=np.eye(4)) for i in range(2)]
+    view = random_observation(20)
+    run = run_of(records, SlamState(map, view, jaxlie.SE3.identity(), exact_estimate(), jnp.asarray(2)), config)
+    noise = None if stays == "no noise" else 0.02
+    nodes = tuple(replace(node, depth_noise=noise) for node in run.atlas.graph.nodes)
+    submaps = {0: replace(run.atlas.submaps[0], is_frozen=stays == "frozen")}
+    run = replace(run, atlas=replace(run.atlas, graph=replace(run.atlas.graph, nodes=nodes), submaps=submaps))
+    ended = finish_run(run, is_interrupted=stays == "interrupted")
+    np.testing.assert_array_equal(ended.map.gaussians.valid, is_second | (stays is not None))
 
 
 def test_how_far_the_last_frame_sees_is_said_by_its_valid_points_alone():
