@@ -56,8 +56,24 @@ RENAMED = {  # keys of earlier versions; the longest match counts
     "prior.structure.masks": "masks.folder",
     "prior.dense.depth.depth_step": "prior.dense.depth_step",
 }
+LENGTHS = (
+    *(f"slam.{stage}.min_std" for stage in ("fit", "em", "splitting")),
+    *("densify.min_std", "slam.submap.voxel_size", "slam.submap.margin"),
+)
 OPEN = ("baseline", "variants", "tolerances", "suite")  # nodes that take any name
 NO_WORD = (ValueError, TypeError, AssertionError)  # raised by Hydra if an option of a group is no word
+
+
+def in_unit_of(prior: Prior, config: DictConfig) -> DictConfig:
+    """Return the config with its lengths in the unit of a prior, see `Prior.metre`; it says so."""
+    if prior.metre == 1:
+        return config
+    lengths = {key: prior.metre * OmegaConf.select(config, key) for key in LENGTHS}
+    config = copy.deepcopy(config)
+    for key, value in lengths.items():
+        OmegaConf.update(config, key, value)
+    tqdm.write(f"lengths of slam= and densify= are {prior.metre:.3g} times as large, for the unit of the prior")
+    return config
 
 
 def build(config: DictConfig, key: str, **more: Any) -> Any:

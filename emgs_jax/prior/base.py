@@ -111,6 +111,14 @@ class Prior(ABC):
     def keep(self, folder: Path) -> None:  # noqa: B027 (most have nothing to keep)
         """Store what the predictions depend on in the folder of a run, or load it from there."""
 
+    @property
+    def metre(self) -> float:
+        """A metre of the settings, such as the floor of covariances, in the unit of the predictions, after `keep`.
+
+        1 unless the predictions are in a unit in which scenes look much nearer or farther than rooms do.
+        """
+        return 1.0
+
     def report(self) -> dict[str, float]:
         """Statistics of the predictions so far, as keys `prior/…`."""
         return {}

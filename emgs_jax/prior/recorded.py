@@ -16,6 +16,7 @@ Files are written atomically, data before the manifest: `record` completes what 
 import hashlib
 import io
 import json
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -122,7 +123,7 @@ def record(
         "feature_names": list(prior.feature_names),
         "num_inferences": len(calls),
         "complete": False,
-    }
+    } | ({} if prior.metre == 1 else {"metre": prior.metre})
     header = json.loads(json.dumps(header))  # as it will be read
     files = _resume(folder, header)
     folder.mkdir(parents=True, exist_ok=True)
@@ -179,6 +180,14 @@ class Recorded(Prior):
         """The number that was recorded: the first window's newer views come after the dense ones."""
         first = self._load("000000.npz", ("views", "dense"))
         return 1 + len(first["views"]) - len(first["dense"])
+
+    @property
+    def metre(self) -> float:
+        """That of the prior that was recorded."""
+        metre = self._manifest.get("metre", 1.0)
+        if type(metre) is not float or not 0 < metre < math.inf:
+            raise ValueError(f"{self.folder / 'manifest.json'}: metre must be a positive number, got {metre}: {REMEDY}")
+        return metre
 
     def check(self, dataset: Dataset, window_size: int) -> None:
         """Raise ValueError unless the recording is of this data set, calibration and window size."""
@@ -258,9 +267,9 @@ def _resume(folder: Path, header: dict) -> dict[str, str]:
         return {}
     old = _read_manifest(folder)
     for key in header.keys() - {"complete"}:
-        if old[key] != header[key]:
+        if old.get(key) != header[key]:
             raise ValueError(
-                f"{folder} holds a recording with {key} {old[key]}, not {header[key]}: choose another folder"
+                f"{folder} holds a recording with {key} {old.get(key)}, not {header[key]}: choose another folder"
             )
     return old["files"]
 

@@ -28,6 +28,10 @@ class Wrapped(Prior):
     def keep(self, folder: Path) -> None:
         self._prior.keep(folder)
 
+    @property
+    def metre(self) -> float:
+        return self._prior.metre
+
     def report(self) -> dict[str, float]:
         return self._prior.report()
 

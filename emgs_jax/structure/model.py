@@ -88,11 +88,16 @@ def to_structure(models: Sequence[Any], names: Sequence[str], config: StructureC
     return structure if own else in_unit(structure, config.median_depth)
 
 
-def _is_usual(structure: Structure) -> bool:
-    """Test whether the unit of a model that is given can stay, and say what becomes of it."""
+def median_depth(structure: Structure) -> float:
+    """How far the landmarks of an image are in the median, over all images; 1 without any."""
     shown = (structure.depths(frame) for frame in np.flatnonzero(structure.is_placed))
     depths = [np.median(depths) for depths in shown if len(depths)]
-    median, (low, high) = float(np.median(depths)) if depths else 1.0, USUAL
+    return float(np.median(depths)) if depths else 1.0
+
+
+def _is_usual(structure: Structure) -> bool:
+    """Test whether the unit of a model that is given can stay, and say what becomes of it."""
+    median, (low, high) = median_depth(structure), USUAL
     if low <= median <= high:
         tqdm.write(f"prior.structure.model: its unit stays (its images look {median:.3g} far, in the median)")
         return True

@@ -311,3 +311,16 @@ def test_of_visits_of_which_the_prior_knows_nothing_nothing_is_recorded(folder, 
     before = contents(folder)
     monkeypatch.setattr(prior, "revisit", lambda *_: None)
     assert record_visits(prior, room, WINDOW_SIZE, folder, [(0, 4)], 1) == 0 and contents(folder) == before
+
+
+def test_a_metre_of_the_settings_is_recorded_and_a_recording_without_one_is_in_metres(tmp_path, room, folder):
+    class Other(Simulated):
+        metre = 5.15
+
+    record(Other(seed=5), room, WINDOW_SIZE, tmp_path / "other")
+    assert Recorded(tmp_path / "other").metre == 5.15 and Recorded(folder).metre == 1.0
+    with pytest.raises(ValueError, match="holds a recording with metre None, not 5.15"):
+        record(Other(seed=5, feature_size=4, classes=room.classes), room, WINDOW_SIZE, folder)
+    forge_manifest(tmp_path / "other", lambda manifest: manifest.update(metre=-1.0))
+    with pytest.raises(ValueError, match="manifest.json: metre must be a positive number, got -1.0: record"):
+        _ = Recorded(tmp_path / "other").metre

@@ -1,6 +1,7 @@
 """Recording and replay; oracle: the live run's bytes."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import hydra
@@ -9,8 +10,11 @@ import pytest
 from tiny_run import NUM_FRAMES, WINDOW_SIZE, compose, dataset
 
 import experiments.predict
+import experiments.run
+from emgs_jax.config.configure import build_prior
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.simulated.prior import Simulated
+from emgs_jax.prior.wrapped import Wrapped
 from experiments.predict import predict
 from experiments.run import run
 
@@ -76,3 +80,37 @@ def test_a_run_from_the_recording_writes_the_same_bytes_as_the_live_run(tmp_path
     same = [key for key in live if not key.startswith(("time/", "memory/", "provenance"))]
     assert {key: live[key] for key in same} == {key: replay[key] for key in same}
     assert replay["provenance"]["prior"] == live["provenance"]["prior"] and replay["provenance"]["simulated"] is True
+
+
+class Quadruple(Wrapped):
+    """A prior in another unit, in which all lengths are four times as long."""
+
+    metre = 4.0
+
+    def predict(self, window, frames, intrinsics):
+        found = super().predict(window, frames, intrinsics)
+        T = found.T_anchor_view.copy()
+        T[:, :3, 3] *= 4
+        return replace(found, T_anchor_view=T, points=4 * found.points)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("is_recorded", [False, True])
+def test_a_map_in_another_unit_is_the_same_map(tmp_path, exact_run, monkeypatch, is_recorded, capsys):
+    """Symptom: a given model of COLMAP, in its own unit, made a worse map than the same structure made by the run."""
+    words, module = ("prior.level=0",), experiments.predict if is_recorded else experiments.run
+    monkeypatch.setattr(module, "build_prior", lambda *parts: Quadruple(build_prior(*parts)))
+    if is_recorded:
+        folder = record(tmp_path / "recording", *words)
+        words = "prior=recorded", f"prior.folder={folder}"
+    (tmp_path / "run").mkdir()
+    metrics = run(compose(*words), tmp_path / "run")
+    assert "are 4 times as large, for the unit of the prior" in "".join(capsys.readouterr())
+    there, here = np.load(tmp_path / "run" / "map.npz"), np.load(exact_run[0] / "map.npz")
+    valid = here["gaussians.valid"]
+    np.testing.assert_array_equal(there["gaussians.valid"], valid)
+    np.testing.assert_allclose(
+        there["gaussians.means"][valid], 4 * here["gaussians.means"][valid], rtol=1e-4, atol=1e-3
+    )
+    settings = metrics["provenance"]["config"]
+    assert settings["slam"]["fit"]["min_std"] == settings["densify"]["min_std"] == 4 * compose().slam.fit.min_std

@@ -5,8 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pycolmap
 import pytest
+from scene import compose
 from stereo_scene import structure_config
 
+from emgs_jax.config.configure import build
 from emgs_jax.data.intrinsics import Pictures
 from emgs_jax.structure import sequence
 from emgs_jax.structure.given import given_models
@@ -93,6 +95,19 @@ def test_the_unit_of_a_model_stays_unless_it_is_millimetres(tmp_path, capsys, fa
     assert ("its unit stays" in said) == stays and ("its unit is changed" in said) != stays
     depths = np.concatenate([found.depths(frame) for frame in range(NUM)])
     assert stays or np.median(depths) == pytest.approx(structure_config().median_depth)
+
+
+@pytest.mark.parametrize(("factor", "words"), [(1.0, ()), (8.0, ()), (8.0, ("scale.height=1.5",))])
+def test_a_metre_of_the_settings_is_that_of_an_own_structure(tmp_path, factor, words):
+    """Symptom: in a model whose images look 10 far, covariances had a floor of a fifth, and walls were double."""
+    model = scene()
+    model.transform(pycolmap.Sim3d(factor, pycolmap.Rotation3d(), np.zeros(3)))
+    _, found = given(tmp_path, model)
+    prior = build(compose("prior=multiview_stereo", f"prior.structure.model={tmp_path}/model", *words), "prior")
+    prior._take = lambda frame: found
+    own = build(compose("prior=multiview_stereo"), "prior")
+    depths = np.median([np.median(found.depths(frame)) for frame in range(NUM)])
+    assert own.metre == 1.0 and prior.metre == (1.0 if words else pytest.approx(depths / 2.0))
 
 
 def test_a_database_is_mapped_by_the_camera_that_is_known_and_says_so(tmp_path, capsys):

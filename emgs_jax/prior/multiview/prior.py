@@ -38,7 +38,7 @@ from emgs_jax.prior.sources import placed_beside, sources_of
 from emgs_jax.scale.metres import ScaleConfig, View, metres_of
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import names_at
-from emgs_jax.structure.model import NONE, Structure, scaled
+from emgs_jax.structure.model import NONE, Structure, median_depth, scaled
 from emgs_jax.structure.sequence import follow_images, structure_of
 
 jitted_difference = eqx.filter_jit(mean_difference)
@@ -125,6 +125,14 @@ class MultiviewStereo(Prior):
         placed = 100 * float(self._known.is_placed.mean())
         known = {} if self._scale_std is None else {"prior/scale_std_percent": 100 * self._scale_std}
         return {"prior/placed_percent": placed, "prior/num_worlds": len(self._known.worlds)} | known
+
+    @property
+    def metre(self) -> float:
+        """That of an own structure for a given one, whose unit stays: its median depth over `median_depth`."""
+        if self._config.model is None or self.provenance.settings.get("unit") == "m":
+            return 1.0
+        found = self._take(0)
+        return median_depth(found) / self._config.median_depth if found.is_placed.any() else 1.0
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict; a view that is in no model has NaN and no valid point."""
