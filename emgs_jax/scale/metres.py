@@ -85,6 +85,7 @@ def metres_of(
     poses: Float[np.ndarray, "n 4 4"],
     world: Int[np.ndarray, " n"],
     view: Callable[[int], View],
+    scales: Sequence[Scale | None] = (),
 ) -> list[Metres]:
     """Find scale and up of each world of a structure, by all sources that are given.
 
@@ -92,15 +93,18 @@ def metres_of(
         poses: T_world_camera of each frame, in the unit of its world; NaN without one.
         world: number of each frame's world, from 0; -1 without one.
         view: what a frame with a pose shows.
+        scales: what else is known of each world's scale, such as by a network.
 
     Raises:
         ValueError: a source cannot be read, or says nothing of any world.
     """
     names, read = names_of(dataset), _read(config, dataset)
-    found = [
-        _of_world(config, dataset, read, poses, np.flatnonzero(world == one), names, view)
-        for one in range(max(world) + 1)
-    ]
+    found = []
+    for one in range(max(world) + 1):
+        own, up, notes = _of_world(config, dataset, read, poses, np.flatnonzero(world == one), names, view)
+        own += filter(None, scales[one : one + 1])
+        scale, warning = combined(own) if own else (None, None)
+        found.append(Metres(scale, up, tuple(filter(None, [warning, *notes]))))
     if all(one.scale is None for one in found):
         raise ValueError("scale: " + "; ".join(note for one in found for note in one.notes))
     return found
@@ -129,7 +133,8 @@ def _of_world(
     frames: Int[np.ndarray, " k"],
     names: Sequence[str],
     view: Callable[[int], View],
-) -> Metres:
+) -> tuple[list[Scale], Float[np.ndarray, "3"], list[str]]:
+    """Scales of a world by each source that is given, its up, and notes."""
     poses, focal = all_poses[frames], dataset.intrinsics[0]
     up, scales, notes = up_of_cameras(poses[:, :3, :3]), [], []
     for image, *pixels, metres in config.distances:
@@ -169,10 +174,7 @@ def _of_world(
             scales.append(motion.scale)
             up = motion.up
             notes.append(f"gravity by the imu (± {motion.up_std_deg:.1f}°)")
-    if not scales:
-        return Metres(None, up, tuple(notes))
-    scale, warning = combined(scales)
-    return Metres(scale, up, tuple(filter(None, [warning, *notes])))
+    return scales, up, notes
 
 
 def _frame_of(image: str, names: Sequence[str]) -> int:

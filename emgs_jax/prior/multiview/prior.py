@@ -35,6 +35,7 @@ from emgs_jax.prior.multiview.matched import begin_matched
 from emgs_jax.prior.multiview.monocular_network import MeterConfig, way_of_meter
 from emgs_jax.prior.multiview.swept import SweptConfig, swept
 from emgs_jax.prior.sources import placed_beside, sources_of
+from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.metres import ScaleConfig, View, metres_of
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import names_at
@@ -119,7 +120,7 @@ class MultiviewStereo(Prior):
 
     def report(self) -> dict[str, float]:
         """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models, and, in
-        metres by `scale=`, `prior/scale_std_percent`."""
+        metres, `prior/scale_std_percent`."""
         if self._known is None:
             return {}
         placed = 100 * float(self._known.is_placed.mean())
@@ -169,10 +170,11 @@ class MultiviewStereo(Prior):
             self._camera = Camera(np.float32(intrinsics[:2]), np.float32(intrinsics[2:]), width, height)
             self._up_to, self._is_straight = self._begin()
             self._known = self._up_to(frame)
-            self._newest, depths = self._way.begin(Scene(self._dataset, lambda: self._known, self._lens, self._camera))
+            self._newest = lambda: self._known
+            depths, scales = self._way.begin(Scene(self._dataset, self._newest, self._lens, self._camera))
             self._depths = lru_cache(NUM_KEPT)(depths)  # a frame's neighbours ask for its depth again
-            if self._metres.is_given:
-                self._to_metres(self._newest())
+            if self._metres.is_given or any(scales):
+                self._to_metres(self._newest(), scales)
         self._known = self._up_to(frame)
         return self._newest()
 
@@ -186,14 +188,19 @@ class MultiviewStereo(Prior):
         found, is_straight = structure_of(self._dataset, self._config, self._folder)
         return lambda frame: found, is_straight
 
-    def _to_metres(self, found: Structure) -> None:
-        """Bring structure and depths into metres by the lengths that are known; other worlds keep their unit."""
+    def _to_metres(self, found: Structure, scales: Sequence[Scale | None]) -> None:
+        """Bring structure and depths into metres by the lengths that are known; other worlds keep their unit.
+
+        Args:
+            scales: of each world, by depths in metres; empty without such.
+        """
 
         def view(frame: int) -> View:
             points, confidence, _ = self._answer(frame)
             return View(points, 1.0 / confidence)
 
-        each, depths = metres_of(self._metres, self._dataset, found.T_world_camera, found.world, view), self._depths
+        each = metres_of(self._metres, self._dataset, found.T_world_camera, found.world, view, scales)
+        depths = self._depths
         factors = np.ones(len(each))
         for world, (scale, _, notes) in enumerate(each):
             of = f" of model {world}" if len(each) > 1 else ""
