@@ -13,7 +13,7 @@ from emgs_jax.data.euroc import read_sensor
 from emgs_jax.data.masks import files_of, names_of, stem
 from emgs_jax.ops.ranges import number
 from emgs_jax.scale.estimate import Scale, combined, scale_from
-from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_level, surfaces_of
+from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_of, surfaces_of
 from emgs_jax.scale.inertial import Inertial, read_inertial, scale_of_motion
 from emgs_jax.scale.positions import positions_of_exif, read_positions, scale_of_positions
 from emgs_jax.scale.tape import point_at, scale_of_distance
@@ -152,7 +152,7 @@ def _of_world(
         points, stds = (np.stack(part) for part in zip(*ends, strict=True))
         scales.append(scale_of_distance(points, stds, focal, float(metres), f"distance in {image}"))
     if config.height is not None:
-        up, scale = _by_floor(config.height, frames, poses, view, focal, up)
+        up, scale = _by_floor(config.height, frames, poses, view, up)
         scales += [] if scale is None else [scale]
         notes += ["no floor was found below the cameras"] if scale is None else []
     if read.positions is not None:
@@ -193,7 +193,6 @@ def _by_floor(
     frames: np.ndarray,
     poses: Float[np.ndarray, "n 4 4"],
     view: Callable[[int], View],
-    focal: float,
     up: Float[np.ndarray, "3"],
 ) -> tuple[Float[np.ndarray, "3"], Scale | None]:
     """Find up by floors and walls, and the scale by the median height of the cameras above the floor."""
@@ -202,16 +201,16 @@ def _by_floor(
     for row in rows:
         points = view(int(frames[row])).points
         step = max(round(max(points.shape[:2]) / PIXELS), 1)
-        each.append(surfaces_of(points, poses[row], step))
+        each.append(surfaces_of(points, poses[row], step, int(row)))
     surfaces = Surfaces(*(np.concatenate(part) for part in zip(*each, strict=True)))
     up = up_of_surfaces(up, surfaces.normals, surfaces.areas)
-    level = floor_level(surfaces, up, poses[:, :3, 3])
-    if level is None:
+    floor = floor_of(surfaces, up, poses[:, :3, 3])
+    if floor is None:
         return up, None
-    heights = poses[:, :3, 3] @ up - level
-    middle = float(np.median(heights))
-    spread = 1.4826 * float(np.median(np.abs(heights - middle))) / middle
-    return up, scale_from("height", height, middle, np.hypot(spread / len(heights) ** 0.5, MIN_STD))
+    middle = float(np.median(floor.heights))
+    spread = 1.4826 * float(np.median(np.abs(floor.heights - middle))) / len(frames) ** 0.5
+    std = np.hypot(spread, floor.std) / middle
+    return floor.normal, scale_from("height", height, middle, np.hypot(std, MIN_STD))
 
 
 def _positions(given: str, dataset: Dataset) -> Float[np.ndarray, "n 3"]:
