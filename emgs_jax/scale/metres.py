@@ -16,10 +16,11 @@ from emgs_jax.scale.estimate import Scale, combined, scale_from
 from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_of, surfaces_of
 from emgs_jax.scale.inertial import Inertial, read_inertial, scale_of_motion
 from emgs_jax.scale.positions import positions_of_exif, read_positions, scale_of_positions
-from emgs_jax.scale.tape import point_at, scale_of_distance
+from emgs_jax.scale.tape import pixel_in, point_at, scale_of_distance, spread_of
 from emgs_jax.scale.up import up_of_cameras, up_of_surfaces
 
 NUM_VIEWS = 24  # frames in which a floor is looked for, evenly spread
+NUM_BESIDE = 8  # frames that are asked for a point's depth, evenly spread
 PIXELS = 60  # of a frame's longer side, whose surfaces are used
 
 
@@ -150,6 +151,8 @@ def _of_world(
                 "another image"
             )
         points, stds = (np.stack(part) for part in zip(*ends, strict=True))
+        world = [all_poses[frame][:3, :3] @ point + all_poses[frame][:3, 3] for point in points]
+        stds = np.hypot(stds, [_spread(point, frames[frames != frame], all_poses, dataset, view) for point in world])
         scales.append(scale_of_distance(points, stds, focal, float(metres), f"distance in {image}"))
     if config.height is not None:
         up, scale = _by_floor(config.height, frames, poses, view, up)
@@ -186,6 +189,25 @@ def _frame_of(image: str, names: Sequence[str]) -> int:
         f"scale.distance: image {image} is not in use: there are {names[0]} to {names[-1]} (dataset.start, stop and "
         "stride choose)"
     )
+
+
+def _spread(
+    point: Float[np.ndarray, "3"],
+    frames: Int[np.ndarray, " k"],
+    poses: Float[np.ndarray, "n 4 4"],
+    dataset: Dataset,
+    view: Callable[[int], View],
+) -> float:
+    """How far frames that show a point of the world are from its depth, see `spread_of`."""
+    size, found = np.array(dataset.size), []
+    for frame in frames:
+        pixel, depth = pixel_in(point, poses[frame], dataset.intrinsics)
+        if depth > 0 and ((pixel >= 0) & (pixel <= size - 1)).all():
+            found.append((int(frame), pixel, depth))
+    rows = np.unique(np.linspace(0, len(found) - 1, min(NUM_BESIDE, len(found))).round().astype(int))
+    said = [(found[row][2], point_at(*view(found[row][0]), found[row][1])) for row in rows]
+    known = [(depth, float(seen[0][2])) for depth, seen in said if seen is not None]
+    return spread_of([depth for depth, _ in known], [seen for _, seen in known])
 
 
 def _by_floor(

@@ -98,6 +98,19 @@ def test_a_distance_between_pixels_of_the_image_on_disk(tmp_path):
     assert found.scale.source.startswith("distance in a03.jpg (± ")
 
 
+def test_a_distance_where_frames_disagree_is_less_sure(tmp_path):
+    """The frame of the tape is 20 % too near in all its depths, and says 2 %."""
+
+    def wrong(frame):
+        points, std = view(frame)
+        return View((0.8 if frame == 3 else 1.0) * points, std)
+
+    (right,) = measured(tmp_path, ScaleConfig(distance=tape()))
+    (found,) = metres_of(ScaleConfig(distance=tape()), Photos(tmp_path), *structure(), wrong)
+    assert found.scale.log - right.scale.log == pytest.approx(-np.log(0.8), rel=0.05)
+    assert right.scale.std < 0.045 and found.scale.std > 0.2
+
+
 def test_several_distances_are_more_certain(tmp_path):
     (one,), (three,) = (
         measured(tmp_path, ScaleConfig(distance=given))
