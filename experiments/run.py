@@ -58,6 +58,8 @@ from .command import command
 from .interrupt import cameras_first
 from .shorthand import with_source
 
+ALSO_SAID = "segmentation/miou_percent", "trajectory/scale_off_std"  # beside prior/…, when a run has ended
+
 
 def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     """Map the sequence of `config`, write every output into `folder` and return the metrics."""
@@ -229,7 +231,7 @@ def run_and_print(config: DictConfig) -> float:
     metrics = run(config, folder)
     print(metrics_table(metrics) if "trajectory/num_frames" in metrics else why_no_errors(metrics))
     for key, value in metrics.items():
-        if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):
+        if value is not None and (key.startswith("prior/") or key in ALSO_SAID):
             print(f"{key} {value:.4g}")
     print(f"{last_words(metrics)}everything is in {folder}, {REPORT_FILE} shows it")
     error = metrics.get("trajectory/ate_sim3_m")
