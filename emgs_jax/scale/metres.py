@@ -15,7 +15,7 @@ from emgs_jax.ops.ranges import number
 from emgs_jax.scale.estimate import Scale, combined, scale_from
 from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_of, surfaces_of
 from emgs_jax.scale.inertial import Inertial, read_inertial, scale_of_motion
-from emgs_jax.scale.positions import positions_of_exif, read_positions, scale_of_positions
+from emgs_jax.scale.positions import positions_of_exif, positions_of_poses, read_positions, scale_of_positions
 from emgs_jax.scale.tape import pixel_in, point_at, scale_of_distance, spread_of
 from emgs_jax.scale.up import up_of_cameras, up_of_surfaces
 
@@ -32,7 +32,8 @@ class ScaleConfig:
     # they show
     distance: Sequence[Any] | None = None
     height: float | None = number(None, low=1e-3, high=1e4)  # metres of the camera above the floor, in the median
-    positions: str | None = None  # of the cameras: exif (GPS of photos), or a file, see `read_positions`
+    # Of the cameras: exif (GPS of photos), dataset (its poses, in metres), or a file, see `read_positions`
+    positions: str | None = None
     imu: str | None = None  # file of an inertial measurement unit, see `read_inertial`
     # camera → unit: 16 numbers row by row, or a sensor.yaml of the camera as EuRoC has
     T_imu_camera: Sequence[float] | str | None = number(None, low=-1e3, high=1e3)
@@ -238,6 +239,8 @@ def _by_floor(
 def _positions(given: str, dataset: Dataset) -> Float[np.ndarray, "n 3"]:
     if given == "exif":
         return positions_of_exif(files_of(dataset)[0])
+    if given == "dataset":
+        return positions_of_poses([dataset.pose(index) for index in range(len(dataset))], dataset.name)
     times = [dataset[index].timestamp for index in range(len(dataset))]
     return read_positions(Path(given).expanduser(), names_of(dataset), times)
 

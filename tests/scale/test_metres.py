@@ -133,6 +133,14 @@ def test_positions_give_scale_and_up(tmp_path):
     assert found.scale.factor == pytest.approx(1 / UNIT, rel=1e-4) and angle(found.up) < 0.1
 
 
+def test_poses_of_the_data_set_give_scale_and_up(tmp_path):
+    dataset = Photos(tmp_path)
+    dataset.name, dataset.pose = "photos", lambda index: None if index == 4 else poses()[index]
+    (found,) = metres_of(ScaleConfig(positions="dataset"), dataset, *structure(), view)
+    assert found.scale.factor == pytest.approx(1 / UNIT, rel=1e-4) and angle(found.up) < 0.1
+    assert "11 positions fit" in found.notes[0]
+
+
 def test_sources_that_disagree_are_said(tmp_path):
     length = tape()[-1]
     (found,) = measured(tmp_path, ScaleConfig(distance=tape(metres=2 * length), height=HEIGHT))
