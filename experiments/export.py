@@ -10,7 +10,16 @@ from emgs_jax.config.values import check_keys
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import check_writable, new_folder, owned
 from emgs_jax.ops.camera import Camera
-from emgs_jax.runs.export import IMAGE_FORMATS, MOVED_FILE, ExportConfig, export, find_factor, to_export, write_moved
+from emgs_jax.runs.export import (
+    IMAGE_FORMATS,
+    MOVED_FILE,
+    ExportConfig,
+    export,
+    find_factor,
+    measured_up,
+    to_export,
+    write_moved,
+)
 from emgs_jax.runs.finished_run import FinishedRun, read_run
 from emgs_jax.runs.images import images_of
 
@@ -48,7 +57,8 @@ def export_run(config: DictConfig) -> list[Path]:
     if factor is not None:
         print(f"all lengths times {factor:.6g}")
     if wanted.up == "z":
-        print(f"z is up, by level cameras, floors and walls; {MOVED_FILE} says how the run was turned")
+        by = "what told the scale" if measured_up(run) is not None else "level cameras, floors and walls"
+        print(f"z is up, by {by}; {MOVED_FILE} says how the run was turned")
     return sorted(target.iterdir())
 
 

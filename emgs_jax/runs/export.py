@@ -20,6 +20,7 @@ from emgs_jax.io.ply_reader import read_vertices, transform_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.ranges import number, one_of
+from emgs_jax.prior.base import UP_KEYS
 from emgs_jax.runs.finished_run import POINTS_FILE, FinishedRun
 from emgs_jax.runs.moving import moving_mask
 
@@ -153,8 +154,16 @@ def to_export(run: FinishedRun, factor: float | None, up: str) -> Sim3 | None:
     rotation = np.eye(3)
     if up == "z":
         poses = run.poses[run.is_placed] if run.is_placed.any() else run.poses[:1]
-        rotation = view_from_above(poses, np.asarray(run.map.gaussians.normals)[np.asarray(run.map.gaussians.valid)])
+        normals = np.asarray(run.map.gaussians.normals)[np.asarray(run.map.gaussians.valid)]
+        rotation = view_from_above(poses, normals, measured_up(run))
     return Sim3(1.0 if factor is None else factor, rotation, np.zeros(3))
+
+
+def measured_up(run: FinishedRun) -> np.ndarray | None:
+    """Return up in a run's world, (3,), by what told its scale (floor, positions, inertial unit); None without such."""
+    if UP_KEYS[0] not in run.metrics or not run.is_placed.any():
+        return None
+    return run.poses[run.is_placed][0, :3, :3] @ [run.metrics[key] for key in UP_KEYS]
 
 
 def write_moved(run: FinishedRun, folder: Path, T_export_map: Sim3) -> FinishedRun:

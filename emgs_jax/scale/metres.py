@@ -77,7 +77,7 @@ class Metres(NamedTuple):
     """What the sources say of a world."""
 
     scale: Scale | None  # None: nothing
-    up: Float[np.ndarray, "3"]  # unit vector in the world
+    up: Float[np.ndarray, "3"] | None  # unit vector in the world; None unless a source tells it
     notes: tuple[str, ...]
 
 
@@ -135,10 +135,10 @@ def _of_world(
     frames: Int[np.ndarray, " k"],
     names: Sequence[str],
     view: Callable[[int], View],
-) -> tuple[list[Scale], Float[np.ndarray, "3"], list[str]]:
-    """Scales of a world by each source that is given, its up, and notes."""
+) -> tuple[list[Scale], Float[np.ndarray, "3"] | None, list[str]]:
+    """Scales of a world by each source that is given, its up by the last that tells it, and notes."""
     poses, focal = all_poses[frames], dataset.intrinsics[0]
-    up, scales, notes = up_of_cameras(poses[:, :3, :3]), [], []
+    up, scales, notes = None, [], []
     for image, *pixels, metres in config.distances:
         frame = _frame_of(str(image), names)
         if frame not in frames:
@@ -156,7 +156,7 @@ def _of_world(
         stds = np.hypot(stds, [_spread(point, frames[frames != frame], all_poses, dataset, view) for point in world])
         scales.append(scale_of_distance(points, stds, focal, float(metres), f"distance in {image}"))
     if config.height is not None:
-        up, scale = _by_floor(config.height, frames, poses, view, up)
+        up, scale = _by_floor(config.height, frames, poses, view)
         scales += [] if scale is None else [scale]
         notes += ["no floor was found below the cameras"] if scale is None else []
     if read.positions is not None:
@@ -216,8 +216,7 @@ def _by_floor(
     frames: np.ndarray,
     poses: Float[np.ndarray, "n 4 4"],
     view: Callable[[int], View],
-    up: Float[np.ndarray, "3"],
-) -> tuple[Float[np.ndarray, "3"], Scale | None]:
+) -> tuple[Float[np.ndarray, "3"] | None, Scale | None]:
     """Find up by floors and walls, and the scale by the median height of the cameras above the floor."""
     rows = np.unique(np.linspace(0, len(frames) - 1, min(NUM_VIEWS, len(frames))).round().astype(int))
     each = []
@@ -226,10 +225,10 @@ def _by_floor(
         step = max(round(max(points.shape[:2]) / PIXELS), 1)
         each.append(surfaces_of(points, poses[row], step, int(row)))
     surfaces = Surfaces(*(np.concatenate(part) for part in zip(*each, strict=True)))
-    up = up_of_surfaces(up, surfaces.normals, surfaces.areas)
+    up = up_of_surfaces(up_of_cameras(poses[:, :3, :3]), surfaces.normals, surfaces.areas)
     floor = floor_of(surfaces, up, poses[:, :3, 3])
     if floor is None:
-        return up, None
+        return None, None
     middle = float(np.median(floor.heights))
     spread = 1.4826 * float(np.median(np.abs(floor.heights - middle))) / len(frames) ** 0.5
     std = np.hypot(spread, floor.std) / middle

@@ -19,7 +19,8 @@ from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
 from emgs_jax.io.ply_reader import read_vertices, transform_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
-from emgs_jax.runs.export import factor_of, write_moved
+from emgs_jax.prior.base import UP_KEYS
+from emgs_jax.runs.export import factor_of, measured_up, to_export, write_moved
 from emgs_jax.runs.finished_run import read_run
 from experiments.export import export_run
 
@@ -190,6 +191,15 @@ def test_z_is_up_in_a_turned_export_of_all_files_alike_and_the_run_stays(run, ca
     np.testing.assert_allclose(
         np.asarray(map.gaussians.means)[valid], np.asarray(run.map.gaussians.means)[valid] @ T[:3, :3].T, atol=1e-5
     )
+
+
+def test_up_is_that_of_the_source_which_told_the_scale(run):
+    """Known in the first camera's axes, whatever cameras and walls say."""
+    up = np.array([0.6, 0.0, 0.8])
+    known = replace(run, metrics=run.metrics | dict(zip(UP_KEYS, map(float, run.poses[0, :3, :3].T @ up), strict=True)))
+    np.testing.assert_allclose(measured_up(known), up, atol=1e-9)
+    np.testing.assert_allclose(to_export(known, None, "z").rotation @ up, [0.0, 0.0, 1.0], atol=1e-9)
+    assert measured_up(run) is None and to_export(known, None, "run") is None
 
 
 def test_a_turned_export_can_have_another_unit_too(run):

@@ -24,7 +24,7 @@ from emgs_jax.data.base import Dataset, Frame, wait_for_all
 from emgs_jax.data.masks import check_names
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
-from emgs_jax.prior.base import DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
+from emgs_jax.prior.base import UP_KEYS, DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
 from emgs_jax.prior.multiview.dense import DenseConfig, Depth, Scene, Way
 from emgs_jax.prior.multiview.depth import mean_difference
 from emgs_jax.prior.multiview.depth_files import DepthFilesConfig, way_of_files
@@ -93,6 +93,7 @@ class MultiviewStereo(Prior):
         self._lenses: dict[tuple, Lens] = {}
         self._num_adjusted = 0
         self._scale_std: float | None = None
+        self._up: np.ndarray | None = None  # in the axes of the first frame with a pose
 
     def num_newer(self, window_size: int) -> int:
         """All but one: a structure knows all images, so the first frame alone begins the map. None online."""
@@ -119,12 +120,15 @@ class MultiviewStereo(Prior):
             self._take(0)
 
     def report(self) -> dict[str, float]:
-        """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models, and, in
-        metres, `prior/scale_std_percent`."""
+        """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models.
+
+        In metres also `prior/scale_std_percent`, and `prior/up_x`, y, z, see `UP_KEYS`, if a source tells up.
+        """
         if self._known is None:
             return {}
         placed = 100 * float(self._known.is_placed.mean())
         known = {} if self._scale_std is None else {"prior/scale_std_percent": 100 * self._scale_std}
+        known |= {} if self._up is None else dict(zip(UP_KEYS, map(float, self._up), strict=True))
         return {"prior/placed_percent": placed, "prior/num_worlds": len(self._known.worlds)} | known
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
@@ -208,6 +212,8 @@ class MultiviewStereo(Prior):
             tqdm.write(f"scale{of}: {'; '.join([*said, *notes])}")
             factors[world] = 1.0 if scale is None else scale.factor
         self._scale_std = next(scale.std for scale, *_ in each if scale is not None)
+        if each[0].up is not None:  # worlds are in the order of their first frames
+            self._up = found.T_world_camera[np.flatnonzero(found.is_placed)[0], :3, :3].T @ each[0].up
         in_metres = scaled(found, factors)
 
         def depth_in_metres(frame: int) -> Depth:
