@@ -21,7 +21,7 @@ import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.data.base import Dataset, Frame, wait_for_all
-from emgs_jax.data.masks import check_names
+from emgs_jax.data.masks import check_names, names_of
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import UP_KEYS, DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
@@ -41,6 +41,7 @@ from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import names_at
 from emgs_jax.structure.model import NONE, Structure, scaled
 from emgs_jax.structure.sequence import follow_images, structure_of
+from emgs_jax.structure.store import doubtful_in
 
 jitted_difference = eqx.filter_jit(mean_difference)
 NUM_KEPT = 64  # frames whose depths are cached
@@ -122,12 +123,18 @@ class MultiviewStereo(Prior):
     def report(self) -> dict[str, float]:
         """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models.
 
+        Of models that were made here also `prior/doubtful_percent`: frames of those that are said to be doubtful.
         In metres also `prior/scale_std_percent`, and `prior/up_x`, y, z, see `UP_KEYS`, if a source tells up.
         """
         if self._known is None:
             return {}
         placed = 100 * float(self._known.is_placed.mean())
         known = {} if self._scale_std is None else {"prior/scale_std_percent": 100 * self._scale_std}
+        is_own = self._config.model is None and not self._config.online
+        doubtful = doubtful_in(self._folder) if is_own else None
+        if doubtful is not None:
+            is_doubtful = [name in doubtful for name in names_of(self._dataset)]
+            known["prior/doubtful_percent"] = 100 * float(np.mean(self._known.is_placed & is_doubtful))
         known |= {} if self._up is None else dict(zip(UP_KEYS, map(float, self._up), strict=True))
         return {"prior/placed_percent": placed, "prior/num_worlds": len(self._known.worlds)} | known
 
