@@ -11,7 +11,7 @@ MIN_SHARE = 0.15  # of the largest level's area: what is lower than the floor is
 MIN_STD = 0.02  # of the logarithm of a height: the floor's own error
 TILT_DEG = 3.0  # standard deviation between up, as it was, and the normal of the floor
 MAX_OFF = 3.0  # standard deviations within which a patch is of the floor
-NUM_STEPS = 10
+NUM_STEPS = 10  # of choosing the patches of the plane anew
 
 
 class Surfaces(NamedTuple):
