@@ -10,7 +10,16 @@ from emgs_jax.config.values import check_keys
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.io.files import check_writable, new_folder, owned
 from emgs_jax.ops.camera import Camera
-from emgs_jax.runs.export import IMAGE_FORMATS, ExportConfig, export, find_factor, write_scaled
+from emgs_jax.runs.export import (
+    IMAGE_FORMATS,
+    MOVED_FILE,
+    ExportConfig,
+    export,
+    find_factor,
+    measured_up,
+    to_export,
+    write_moved,
+)
 from emgs_jax.runs.finished_run import FinishedRun, read_run
 from emgs_jax.runs.images import images_of
 
@@ -21,13 +30,17 @@ def export_run(config: DictConfig) -> list[Path]:
     """Write the formats of a config; return the files and folders."""
     check_keys(config, ExportConfig)
     formats, length = list(dict.fromkeys(map(str, config.formats))), config.length and [float(n) for n in config.length]
-    wanted = ExportConfig(formats, config.max_points, config.scale, length, str(config.images), str(config.moving))
+    choices = str(config.images), str(config.moving), str(config.up)
+    wanted = ExportConfig(formats, config.max_points, config.scale, length, *choices)
     run = read_run(Path(str(config.folder)))
     folder = run.folder if config.out is None else Path(str(config.out))
     check_writable(folder, f"{'folder' if config.out is None else 'out'}={folder}")
     factor = find_factor(run, wanted)
-    if factor is None and not formats:
-        raise ValueError("formats=[] without scale= or length= writes nothing: give colmap, nerfstudio or frustums")
+    T_export_map = to_export(run, factor, wanted.up)
+    if T_export_map is None and not formats:
+        raise ValueError(
+            "formats=[] without scale=, length= or up=z writes nothing: give colmap, nerfstudio or frustums"
+        )
     dataset = None
     if IMAGE_FORMATS & {*wanted.formats}:
         dataset, note = images_of(run)
@@ -35,13 +48,17 @@ def export_run(config: DictConfig) -> list[Path]:
             raise ValueError(f"{note} formats=[frustums] needs no images")
         if wanted.images == "original":
             run, dataset = at_original_size(run)
-    if factor is None:
+    if T_export_map is None:
         with owned(folder):
             return export(run, folder, wanted, dataset)
-    target = folder / "scaled" if config.out is None else folder
+    target = folder / ("upright" if factor is None else "scaled") if config.out is None else folder
     with owned(target.parent), new_folder(target) as new:
-        export(write_scaled(run, new, factor), new, wanted, dataset)
-    print(f"all lengths times {factor:.6g}")
+        export(write_moved(run, new, T_export_map), new, wanted, dataset)
+    if factor is not None:
+        print(f"all lengths times {factor:.6g}")
+    if wanted.up == "z":
+        by = "what told the scale" if measured_up(run) is not None else "level cameras, floors and walls"
+        print(f"z is up, by {by}; {MOVED_FILE} says how the run was turned")
     return sorted(target.iterdir())
 
 

@@ -28,7 +28,7 @@ from emgs_jax.mapping.pipeline import finish_run, map_frames
 from emgs_jax.mapping.records import FrameRecord, show_records, to_line
 from emgs_jax.mapping.run import MappingRun, check_settings, new_run
 from emgs_jax.mapping.window_input import RawView
-from emgs_jax.prior.base import Prior
+from emgs_jax.prior.base import UP_KEYS, Prior
 from emgs_jax.report.page import write_report
 from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words, why_no_errors
 from emgs_jax.runs.back_end import revisit_note
@@ -57,6 +57,8 @@ from emgs_jax.viewer.ros import NewMapError, RosConfig, RosView, ros_view
 from .command import command
 from .interrupt import cameras_first
 from .shorthand import with_source
+
+ALSO_SAID = "segmentation/miou_percent", "trajectory/scale_off_std"  # beside prior/…, when a run has ended
 
 
 def run(config: DictConfig, folder: Path) -> dict[str, Any]:
@@ -231,7 +233,7 @@ def run_and_print(config: DictConfig) -> float:
     metrics = run(config, folder)
     print(metrics_table(metrics) if "trajectory/num_frames" in metrics else why_no_errors(metrics))
     for key, value in metrics.items():
-        if value is not None and (key.startswith("prior/") or key == "segmentation/miou_percent"):
+        if value is not None and key not in UP_KEYS and (key.startswith("prior/") or key in ALSO_SAID):
             print(f"{key} {value:.4g}")
     print(f"{last_words(metrics)}everything is in {folder}, {REPORT_FILE} shows it")
     error = metrics.get("trajectory/ate_sim3_m")

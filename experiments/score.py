@@ -27,6 +27,7 @@ from emgs_jax.runs.results import METRICS_FILE, estimates_of, is_finished, resul
 from .command import command
 
 Metrics = dict[str, Any]
+UNIT_STEP = 0.2  # of the log of a scale, within which it is that of another unit
 
 
 def score(config: DictConfig) -> tuple[Metrics, Path]:
@@ -115,6 +116,18 @@ def coverage(metrics: Metrics, min_percent: float) -> str:
     )
 
 
+def unit_note(metrics: Metrics, alignment: str) -> str:
+    """Name the unit of a path that is scored in metres and is a thousand or a hundred times as long; empty if none."""
+    scale, units = metrics["trajectory/scale"], {1e-3: "millimetres", 1e-2: "centimetres", 1e3: "kilometres"}
+    for factor, unit in units.items():
+        if alignment == "se3" and scale and abs(np.log(scale / factor)) < UNIT_STEP:
+            return (
+                f"warning: the path is {1 / scale:.4g} times as long as the true one, as one in {unit}, and "
+                "evaluation.alignment=se3 takes it for metres: write metres, or give evaluation.alignment=sim3"
+            )
+    return ""
+
+
 def _span(times: np.ndarray) -> str:
     return f"{times.min():.3f} to {times.max():.3f}" if len(times) else "none"
 
@@ -124,6 +137,8 @@ def main(config: DictConfig) -> None:
     metrics, path = score(config)
     print(full_table(average(estimates_of(path), each_sequence=True)))
     print(coverage(metrics, config.min_matched_percent))
+    if note := unit_note(metrics, config.evaluation.alignment):
+        print(note)
     if config.points is not None and num_faces(config.points):
         print(
             f"warning: {config.points} is a mesh, and its vertices are what was compared: where triangles are larger "

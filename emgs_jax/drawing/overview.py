@@ -67,15 +67,16 @@ def draw_overview(
     save_figure(path, figure)
 
 
-def view_from_above(poses: np.ndarray, normals: np.ndarray | None = None) -> np.ndarray:
+def view_from_above(poses: np.ndarray, normals: np.ndarray | None = None, up: np.ndarray | None = None) -> np.ndarray:
     """Return world → picture (3, 3) with rows right, forward, up.
 
     Args:
         poses: of cameras that are held level, but may look down: see `up_of_cameras`.
         normals: of the map, (n, 3) of any length, 0 where unknown; floors and walls improve up (`up_of_surfaces`).
+        up: unit vector (3,), if it is known otherwise.
     """
-    up = up_of_cameras(poses[:, :3, :3])
-    if normals is not None:
+    is_known, up = up is not None, up_of_cameras(poses[:, :3, :3]) if up is None else up
+    if normals is not None and not is_known:
         some = normals[:: len(normals) // MAX_NORMALS + 1].astype(np.float64)
         lengths = np.linalg.norm(np.nan_to_num(some), axis=1)
         up = up_of_surfaces(up, some[lengths > 0] / lengths[lengths > 0, None], np.ones(np.sum(lengths > 0)))

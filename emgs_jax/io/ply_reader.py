@@ -6,7 +6,9 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from emgs_jax.geometry import Sim3, rotated
 from emgs_jax.io.files import write_file
 
 REMEDY = "write the file again"
@@ -53,8 +55,10 @@ def num_faces(path: str | os.PathLike) -> int:
     return sum(element.count for element in elements if element.name == "face")
 
 
-def scale_ply(path: str | os.PathLike, target: str | os.PathLike, factor: float) -> None:
-    """Copy a binary PLY that begins with its vertices; x, y, z and Gaussians' scales are multiplied by `factor`.
+def transform_ply(path: str | os.PathLike, target: str | os.PathLike, to_target: Sim3, comment: str = "") -> None:
+    """Copy a binary PLY that begins with its vertices into another world: points, normals, Gaussians' scales and turns.
+
+    `comment` is added to the header.
 
     Raises:
         ValueError: as `read_vertices`, or the file is ascii or has something before the vertices.
@@ -67,11 +71,32 @@ def scale_ply(path: str | os.PathLike, target: str | os.PathLike, factor: float)
     row_type = _row_type(elements[0], order)
     end = start + elements[0].count * row_type.itemsize
     rows = np.frombuffer(content[start:end], row_type).copy()
-    for name in ("x", "y", "z"):
-        rows[name] *= factor
-    for name in {"scale_0", "scale_1", "scale_2"} & {*elements[0].properties}:
-        rows[name] += math.log(factor)
-    write_file(target, content[:start] + rows.tobytes() + content[end:])
+    names = elements[0].properties.keys()
+    _set(rows, "x y z", to_target.apply(_get(rows, "x y z")))
+    for name in {"scale_0", "scale_1", "scale_2"} & names:
+        rows[name] += math.log(to_target.scale)
+    if not np.array_equal(to_target.rotation, np.eye(3)):
+        if {"nx", "ny", "nz"} <= names:
+            _set(rows, "nx ny nz", rotated(_get(rows, "nx ny nz"), to_target.rotation))
+        if "rot_0" in names:
+            turn = Rotation.from_quat(_get(rows, "rot_0 rot_1 rot_2 rot_3"), scalar_first=True)
+            turned = (Rotation.from_matrix(to_target.rotation) * turn).as_quat(canonical=True, scalar_first=True)
+            _set(rows, "rot_0 rot_1 rot_2 rot_3", turned)
+    head = content[:start]
+    if comment:
+        before, found, after = head.rpartition(b"end_header")
+        head = before + f"comment {comment}\n".encode() + found + after
+    write_file(target, head + rows.tobytes() + content[end:])
+
+
+def _get(rows: np.ndarray, names: str) -> np.ndarray:
+    """The columns (n, k) of a structured array, float64."""
+    return np.stack([rows[name].astype(np.float64) for name in names.split()], axis=1)
+
+
+def _set(rows: np.ndarray, names: str, values: np.ndarray) -> None:
+    for name, column in zip(names.split(), values.T, strict=True):
+        rows[name] = column
 
 
 def _header(content: bytes, path: object) -> tuple[str, list[Element], int]:

@@ -10,6 +10,8 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
 
+UP_KEYS = "prior/up_x", "prior/up_y", "prior/up_z"  # in a report: up in the axes of the first frame with a pose
+
 
 @dataclass(frozen=True)
 class Window:

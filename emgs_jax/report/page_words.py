@@ -30,7 +30,7 @@ from emgs_jax.runs.results import sound
 MANY_LOST = 0.1  # share of the frames
 MAX_LOOPS = 500  # largest number listed
 _SE3 = Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True)
-_COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), SHARE, _SE3, *PLACED[:1], *PLACED[3:4], *BY_PATH, *RENDERED)
+_COLUMNS = (MAIN[0]._replace(title="ATE Sim(3) [cm]"), _SE3, SHARE, *PLACED[:1], *PLACED[3:4], *BY_PATH, *RENDERED)
 FILES = {
     "report.html": "this page; any browser of 2023 or later",
     "overview.png": "the map from above with both paths, some frames; any viewer of images",
@@ -134,7 +134,7 @@ def errors(run: FinishedRun) -> Table | None:
     if not any(MAIN[0].key in key for key in metrics):
         return None
     lines = [line._replace(rivals=()) for line in lines_of(metrics, _COLUMNS)]
-    online = {key: metrics.get(key.replace("trajectory/", "trajectory_online/")) for key, *_ in _COLUMNS[:2]}
+    online = {key: metrics.get(key.replace("trajectory/", "trajectory_online/")) for key, *_ in _COLUMNS[:3]}
     if any(value is not None for value in online.values()):
         lines.insert(1, Line(["ours, as placed"], online))
     columns = known(_COLUMNS, [line.values for line in lines])

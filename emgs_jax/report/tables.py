@@ -18,6 +18,7 @@ from emgs_jax.report.columns import (
     cell,
     csv_text,
     if_lacking,
+    known,
     markdown,
     metric_table,
 )
@@ -32,14 +33,19 @@ _PAPER_COLUMNS = (  # title, key, digits; the order of the paper's Table II
     ("Normals [%]", "reconstruction/normals_abs_cos_percent", 1),
     ("Scale [%]", "trajectory/scale_percent", 1),
 )
+SCALE_STD = (  # of a map in metres by `scale=` or a metric network
+    Column("prior/scale_std_percent", "scale ± [%]", 1.0, 1, True),
+    Column("trajectory/scale_off_std", "scale off [σ]", 1.0, 1, True),
+)
 COLUMNS = (
     MAIN[0]._replace(title="ATE Sim(3) [cm]"),
-    SHARE,
     Column("trajectory/ate_se3_m", "ATE SE(3) [cm]", 100.0, 2, True),
+    SHARE,
     *MAIN[1:],
     *PLACED,
     *RENDERED,
     Column("trajectory/scale_percent", "scale [%]", 1.0, 1, False),
+    *SCALE_STD,
     Column("time/seconds_per_frame", "s a frame", 1.0, 2, True),
 )
 _NOTES = """
@@ -116,9 +122,10 @@ def full_table(rows: Sequence[Row]) -> str:
         labels = [row.dataset, over(row.sequences), method, source_of(row), row.protocol, str(len(row.seeds))]
         lines.append(Line(labels, row.values, row.spreads, rivals=None))
     titles = ["data set", "sequence", "method", "source", "protocol", "seeds"]
-    return markdown(
-        metric_table(titles, if_lacking(COLUMNS, [row.values for row in rows]), lines, {row.dataset for row in rows})
-    )
+    values = [row.values for row in rows]
+    unknown = {*SCALE_STD} - {*known(SCALE_STD, values)}
+    columns = [column for column in if_lacking(COLUMNS, values) if column not in unknown]
+    return markdown(metric_table(titles, columns, lines, {row.dataset for row in rows}))
 
 
 def over(sequences: Sequence[str]) -> str:

@@ -9,22 +9,25 @@ import numpy as np
 
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.drawing.colors import OURS, STATUS_COLORS, rgb, save_png
+from emgs_jax.drawing.overview import view_from_above
 from emgs_jax.gaussian_map import transformed
 from emgs_jax.geometry import Sim3
 from emgs_jax.io.cameras import save_colmap, save_frustums, save_transforms
 from emgs_jax.io.files import new_folder, write_json
 from emgs_jax.io.map_file import save_map
 from emgs_jax.io.ply import with_colors, write_ply
-from emgs_jax.io.ply_reader import read_vertices, scale_ply
+from emgs_jax.io.ply_reader import read_vertices, transform_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.ranges import number, one_of
+from emgs_jax.prior.base import UP_KEYS
 from emgs_jax.runs.finished_run import POINTS_FILE, FinishedRun
 from emgs_jax.runs.moving import moving_mask
 
 FORMATS = {"colmap": "colmap", "nerfstudio": "nerfstudio", "frustums": "cameras.ply"}  # and what is written
 IMAGE_FORMATS = {"colmap", "nerfstudio"}
 TRAJECTORIES, CLOUDS = ("trajectory.txt", "trajectory_online.txt"), ("map.ply", "points.ply", "mesh.ply")
+MOVED_FILE = "T_export_map.json"  # y = T x, a similarity, of points x of the run and y of the export
 SHORTEST = 1e-6  # of the run's unit; a shorter distance between two cameras does not determine a scale
 
 
@@ -40,6 +43,7 @@ class ExportConfig:
     images: str = one_of("used", "original", default="used")
     # Moving things stay in the images, or each image has a mask that is black there.
     moving: str = one_of("kept", "masked", default="kept")
+    up: str = one_of("run", "z", default="run")  # the run's own world, or turned such that z is up
 
 
 def export(run: FinishedRun, folder: Path, config: ExportConfig, dataset: ReadableFrames | None) -> list[Path]:
@@ -140,20 +144,45 @@ def factor_of(run: FinishedRun, length: Sequence[float]) -> float:
     return length[2] / distance
 
 
-def write_scaled(run: FinishedRun, folder: Path, factor: float) -> FinishedRun:
-    """Write trajectories, map.npz, clouds and scale.json into an existing `folder`; return the run in that unit.
+def to_export(run: FinishedRun, factor: float | None, up: str) -> Sim3 | None:
+    """Return the similarity from a run's world to that of an export; None if the run's own stays.
 
-    The origin of the world stays. Files that the run lacks are left out; truth and features stay.
+    With z up, x is the path's longest direction, as in `view_from_above`. The origin stays.
     """
-    unit = Sim3.about(np.zeros(3), factor)
+    if factor is None and up == "run":
+        return None
+    rotation = np.eye(3)
+    if up == "z":
+        poses = run.poses[run.is_placed] if run.is_placed.any() else run.poses[:1]
+        normals = np.asarray(run.map.gaussians.normals)[np.asarray(run.map.gaussians.valid)]
+        rotation = view_from_above(poses, normals, measured_up(run))
+    return Sim3(1.0 if factor is None else factor, rotation, np.zeros(3))
+
+
+def measured_up(run: FinishedRun) -> np.ndarray | None:
+    """Return up in a run's world, (3,), by what told its scale (floor, positions, inertial unit); None without such."""
+    if UP_KEYS[0] not in run.metrics or not run.is_placed.any():
+        return None
+    return run.poses[run.is_placed][0, :3, :3] @ [run.metrics[key] for key in UP_KEYS]
+
+
+def write_moved(run: FinishedRun, folder: Path, T_export_map: Sim3) -> FinishedRun:
+    """Write trajectories, map.npz, clouds and the similarity into an existing `folder`; return the run in that world.
+
+    Files that the run lacks are left out; truth and features stay.
+    """
+    is_turned = not np.array_equal(T_export_map.rotation, np.eye(3))
     for name in TRAJECTORIES:
         if (run.folder / name).is_file():
             times, poses = load_trajectory_tum(run.folder / name)
-            save_trajectory_tum(folder / name, times, unit.apply_to_poses(poses))
-    scaled = replace(run, folder=folder, poses=unit.apply_to_poses(run.poses), map=transformed(run.map, **vars(unit)))
-    save_map(folder / "map.npz", scaled.map)
+            save_trajectory_tum(folder / name, times, T_export_map.apply_to_poses(poses))
+    poses, moved = T_export_map.apply_to_poses(run.poses), transformed(run.map, **vars(T_export_map))
+    save_map(folder / "map.npz", moved)
     for name in CLOUDS:
         if (run.folder / name).is_file():
-            scale_ply(run.folder / name, folder / name, factor)
-    write_json(folder / "scale.json", {"factor": factor, "of": run.folder.resolve().name})
-    return scaled
+            transform_ply(run.folder / name, folder / name, T_export_map, "z is up" if is_turned else "")
+    of = run.folder.resolve().name
+    write_json(folder / MOVED_FILE, {"T_export_map": T_export_map.as_matrix().tolist(), "of": of})
+    if T_export_map.scale != 1:
+        write_json(folder / "scale.json", {"factor": T_export_map.scale, "of": of})
+    return replace(run, folder=folder, poses=poses, map=moved)

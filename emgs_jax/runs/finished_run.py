@@ -28,7 +28,7 @@ FRAMES_FILE = "frames.jsonl"
 POINTS_FILE = "points.ply"
 SPLATS_FILE = "splats.ply"
 POLISH = (SPLATS_FILE, "polish.json", "polish.png", "polish.npz", "polish.txt")  # of `experiments.polish`
-EXPORTS = ("colmap", "nerfstudio", "cameras.ply", "scaled")  # what `experiments.export` writes beside them
+EXPORTS = ("colmap", "nerfstudio", "cameras.ply", "scaled", "upright")  # what `experiments.export` writes beside them
 _PROVENANCE = {"protocol": (str, type(None)), "simulated": bool, "git": (dict, type(None))} | {
     # The parts of `provenance.provenance` that are read again, by dotted key.
     **dict.fromkeys(("prior", "data", "versions", "device", "config"), dict),

@@ -13,13 +13,14 @@ from emgs_jax.data.euroc import read_sensor
 from emgs_jax.data.masks import files_of, names_of, stem
 from emgs_jax.ops.ranges import number
 from emgs_jax.scale.estimate import Scale, combined, scale_from
-from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_level, surfaces_of
+from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_of, surfaces_of
 from emgs_jax.scale.inertial import Inertial, read_inertial, scale_of_motion
-from emgs_jax.scale.positions import positions_of_exif, read_positions, scale_of_positions
-from emgs_jax.scale.tape import point_at, scale_of_distance
+from emgs_jax.scale.positions import positions_of_exif, positions_of_poses, read_positions, scale_of_positions
+from emgs_jax.scale.tape import pixel_in, point_at, scale_of_distance, spread_of
 from emgs_jax.scale.up import up_of_cameras, up_of_surfaces
 
 NUM_VIEWS = 24  # frames in which a floor is looked for, evenly spread
+NUM_BESIDE = 8  # frames that are asked for a point's depth, evenly spread
 PIXELS = 60  # of a frame's longer side, whose surfaces are used
 
 
@@ -31,7 +32,8 @@ class ScaleConfig:
     # they show
     distance: Sequence[Any] | None = None
     height: float | None = number(None, low=1e-3, high=1e4)  # metres of the camera above the floor, in the median
-    positions: str | None = None  # of the cameras: exif (GPS of photos), or a file, see `read_positions`
+    # Of the cameras: exif (GPS of photos), dataset (its poses, in metres), or a file, see `read_positions`
+    positions: str | None = None
     imu: str | None = None  # file of an inertial measurement unit, see `read_inertial`
     # camera → unit: 16 numbers row by row, or a sensor.yaml of the camera as EuRoC has
     T_imu_camera: Sequence[float] | str | None = number(None, low=-1e3, high=1e3)
@@ -75,7 +77,7 @@ class Metres(NamedTuple):
     """What the sources say of a world."""
 
     scale: Scale | None  # None: nothing
-    up: Float[np.ndarray, "3"]  # unit vector in the world
+    up: Float[np.ndarray, "3"] | None  # unit vector in the world; None unless a source tells it
     notes: tuple[str, ...]
 
 
@@ -85,6 +87,7 @@ def metres_of(
     poses: Float[np.ndarray, "n 4 4"],
     world: Int[np.ndarray, " n"],
     view: Callable[[int], View],
+    scales: Sequence[Scale | None] = (),
 ) -> list[Metres]:
     """Find scale and up of each world of a structure, by all sources that are given.
 
@@ -92,15 +95,18 @@ def metres_of(
         poses: T_world_camera of each frame, in the unit of its world; NaN without one.
         world: number of each frame's world, from 0; -1 without one.
         view: what a frame with a pose shows.
+        scales: what else is known of each world's scale, such as by a network.
 
     Raises:
         ValueError: a source cannot be read, or says nothing of any world.
     """
     names, read = names_of(dataset), _read(config, dataset)
-    found = [
-        _of_world(config, dataset, read, poses, np.flatnonzero(world == one), names, view)
-        for one in range(max(world) + 1)
-    ]
+    found = []
+    for one in range(max(world) + 1):
+        own, up, notes = _of_world(config, dataset, read, poses, np.flatnonzero(world == one), names, view)
+        own += filter(None, scales[one : one + 1])
+        scale, warning = combined(own) if own else (None, None)
+        found.append(Metres(scale, up, tuple(filter(None, [warning, *notes]))))
     if all(one.scale is None for one in found):
         raise ValueError("scale: " + "; ".join(note for one in found for note in one.notes))
     return found
@@ -129,9 +135,10 @@ def _of_world(
     frames: Int[np.ndarray, " k"],
     names: Sequence[str],
     view: Callable[[int], View],
-) -> Metres:
+) -> tuple[list[Scale], Float[np.ndarray, "3"] | None, list[str]]:
+    """Scales of a world by each source that is given, its up by the last that tells it, and notes."""
     poses, focal = all_poses[frames], dataset.intrinsics[0]
-    up, scales, notes = up_of_cameras(poses[:, :3, :3]), [], []
+    up, scales, notes = None, [], []
     for image, *pixels, metres in config.distances:
         frame = _frame_of(str(image), names)
         if frame not in frames:
@@ -145,9 +152,11 @@ def _of_world(
                 "another image"
             )
         points, stds = (np.stack(part) for part in zip(*ends, strict=True))
+        world = [all_poses[frame][:3, :3] @ point + all_poses[frame][:3, 3] for point in points]
+        stds = np.hypot(stds, [_spread(point, frames[frames != frame], all_poses, dataset, view) for point in world])
         scales.append(scale_of_distance(points, stds, focal, float(metres), f"distance in {image}"))
     if config.height is not None:
-        up, scale = _by_floor(config.height, frames, poses, view, focal, up)
+        up, scale = _by_floor(config.height, frames, poses, view)
         scales += [] if scale is None else [scale]
         notes += ["no floor was found below the cameras"] if scale is None else []
     if read.positions is not None:
@@ -169,10 +178,7 @@ def _of_world(
             scales.append(motion.scale)
             up = motion.up
             notes.append(f"gravity by the imu (± {motion.up_std_deg:.1f}°)")
-    if not scales:
-        return Metres(None, up, tuple(notes))
-    scale, warning = combined(scales)
-    return Metres(scale, up, tuple(filter(None, [warning, *notes])))
+    return scales, up, notes
 
 
 def _frame_of(image: str, names: Sequence[str]) -> int:
@@ -186,35 +192,54 @@ def _frame_of(image: str, names: Sequence[str]) -> int:
     )
 
 
+def _spread(
+    point: Float[np.ndarray, "3"],
+    frames: Int[np.ndarray, " k"],
+    poses: Float[np.ndarray, "n 4 4"],
+    dataset: Dataset,
+    view: Callable[[int], View],
+) -> float:
+    """How far frames that show a point of the world are from its depth, see `spread_of`."""
+    size, found = np.array(dataset.size), []
+    for frame in frames:
+        pixel, depth = pixel_in(point, poses[frame], dataset.intrinsics)
+        if depth > 0 and ((pixel >= 0) & (pixel <= size - 1)).all():
+            found.append((int(frame), pixel, depth))
+    rows = np.unique(np.linspace(0, len(found) - 1, min(NUM_BESIDE, len(found))).round().astype(int))
+    said = [(found[row][2], point_at(*view(found[row][0]), found[row][1])) for row in rows]
+    known = [(depth, float(seen[0][2])) for depth, seen in said if seen is not None]
+    return spread_of([depth for depth, _ in known], [seen for _, seen in known])
+
+
 def _by_floor(
     height: float,
     frames: np.ndarray,
     poses: Float[np.ndarray, "n 4 4"],
     view: Callable[[int], View],
-    focal: float,
-    up: Float[np.ndarray, "3"],
-) -> tuple[Float[np.ndarray, "3"], Scale | None]:
+) -> tuple[Float[np.ndarray, "3"] | None, Scale | None]:
     """Find up by floors and walls, and the scale by the median height of the cameras above the floor."""
     rows = np.unique(np.linspace(0, len(frames) - 1, min(NUM_VIEWS, len(frames))).round().astype(int))
     each = []
     for row in rows:
         points = view(int(frames[row])).points
         step = max(round(max(points.shape[:2]) / PIXELS), 1)
-        each.append(surfaces_of(points, poses[row], step))
+        each.append(surfaces_of(points, poses[row], step, int(row)))
     surfaces = Surfaces(*(np.concatenate(part) for part in zip(*each, strict=True)))
-    up = up_of_surfaces(up, surfaces.normals, surfaces.areas)
-    level = floor_level(surfaces, up, poses[:, :3, 3])
-    if level is None:
-        return up, None
-    heights = poses[:, :3, 3] @ up - level
-    middle = float(np.median(heights))
-    spread = 1.4826 * float(np.median(np.abs(heights - middle))) / middle
-    return up, scale_from("height", height, middle, np.hypot(spread / len(heights) ** 0.5, MIN_STD))
+    up = up_of_surfaces(up_of_cameras(poses[:, :3, :3]), surfaces.normals, surfaces.areas)
+    floor = floor_of(surfaces, up, poses[:, :3, 3])
+    if floor is None:
+        return None, None
+    middle = float(np.median(floor.heights))
+    spread = 1.4826 * float(np.median(np.abs(floor.heights - middle))) / len(frames) ** 0.5
+    std = np.hypot(spread, floor.std) / middle
+    return floor.normal, scale_from("height", height, middle, np.hypot(std, MIN_STD))
 
 
 def _positions(given: str, dataset: Dataset) -> Float[np.ndarray, "n 3"]:
     if given == "exif":
         return positions_of_exif(files_of(dataset)[0])
+    if given == "dataset":
+        return positions_of_poses([dataset.pose(index) for index in range(len(dataset))], dataset.name)
     times = [dataset[index].timestamp for index in range(len(dataset))]
     return read_positions(Path(given).expanduser(), names_of(dataset), times)
 

@@ -51,6 +51,18 @@ def positions_of_exif(files: Sequence[Path | None]) -> Float[np.ndarray, "n 3"]:
     return _in_metres(found)
 
 
+def positions_of_poses(poses: Sequence[Float[np.ndarray, "4 4"] | None], name: str) -> Float[np.ndarray, "n 3"]:
+    """Return the positions of poses in metres, NaN where there is none; ValueError for fewer than `MIN_POSITIONS`."""
+    found = np.array([np.full(3, np.nan) if pose is None else pose[:3, 3] for pose in poses], np.float64)
+    count = int(np.isfinite(found).all(axis=1).sum())
+    if count < MIN_POSITIONS:
+        raise ValueError(
+            f"scale.positions=dataset: {count} of {len(found)} frames of {name} have a pose, and {MIN_POSITIONS} are "
+            "needed"
+        )
+    return found.reshape(-1, 3)
+
+
 def _of_exif(path: Path) -> tuple[float, float, float]:
     """Latitude, longitude (degrees) and altitude (m) of a photo; NaN without them."""
     nothing = (np.nan, np.nan, np.nan)
@@ -100,7 +112,7 @@ def read_positions(path: Path, names: Sequence[str], times: Sequence[float]) -> 
         ValueError: a line cannot be read, or fewer than `MIN_POSITIONS` frames have a position.
     """
     if not path.is_file():
-        raise ValueError(f"scale.positions={path} is no file: give one, or exif")
+        raise ValueError(f"scale.positions={path} is no file: give one, exif or dataset")
     is_geographic, keys, values = False, [], []
     for number, line, words in words_of(path):
         if len(words) == 1 and not keys:

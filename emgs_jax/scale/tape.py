@@ -1,5 +1,7 @@
 """A length that was measured between two pixels of an image."""
 
+from collections.abc import Sequence
+
 import numpy as np
 from jaxtyping import Float
 
@@ -56,3 +58,25 @@ def point_at(
     spread = 1.4826 * float(np.median(np.abs(logs - middle)))
     nearest = some[np.argmin(np.abs(logs - middle))]
     return nearest, float(np.hypot(np.median(stds), spread))
+
+
+def pixel_in(
+    point: Float[np.ndarray, "3"], T_world_camera: Float[np.ndarray, "4 4"], intrinsics: Sequence[float]
+) -> tuple[Float[np.ndarray, "2"], float]:
+    """Return the pixel (column, row) of a point of the world in a frame, and its depth, which is not above 0 behind."""
+    x, y, z = T_world_camera[:3, :3].T @ (point - T_world_camera[:3, 3])
+    fx, fy, cx, cy = intrinsics
+    return (np.array([fx * x / z + cx, fy * y / z + cy]) if z > 0 else np.full(2, np.nan)), float(z)
+
+
+def spread_of(depths: Sequence[float], said: Sequence[float]) -> float:
+    """Return how far frames are from a point's depth: 1.4826 times the median of |log(said / depth)|; 0 without any.
+
+    Where stereo errs, frames differ by far more than they say; one behind another surface is among few.
+
+    Args:
+        depths: of the point in each other frame.
+        said: what that frame has at its pixel.
+    """
+    off = np.abs(np.log(np.asarray(said, np.float64) / np.asarray(depths, np.float64)))
+    return 1.4826 * float(np.median(off)) if len(off) else 0.0

@@ -73,7 +73,7 @@ def given_models(place: Path, shots: Shots, config: StructureConfig) -> list[Any
             shutil.copy(database, Path(work) / DATABASE)
             try:
                 take_camera(Path(work) / DATABASE, shots, key)
-                models, said = map_database(shots, config, Path(work))
+                models, said, _ = map_database(shots, config, Path(work))
                 tell(said)
             except RuntimeError as error:
                 raise ValueError(f"{key} is no database of COLMAP, or a damaged one ({error})") from error

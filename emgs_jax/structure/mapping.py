@@ -50,6 +50,7 @@ class Mapped(NamedTuple):
 
     models: list[Any]
     said: list[str]
+    doubtful: frozenset[str] = frozenset()  # names of images of models that are said to be doubtful
 
 
 def tell(said: Sequence[str]) -> None:
@@ -61,18 +62,18 @@ def tell(said: Sequence[str]) -> None:
 def map_database(shots: Shots, config: StructureConfig, folder: Path) -> Mapped:
     """Map the matches in a folder's database; ValueError, with a reason, if it fails."""
     evidence = read_evidence(folder / DATABASE, shots.names, max(1.0, max(shots.size) / config.max_image_size))
-    found, said = best_start(shots, config, folder, evidence)
+    found, said, doubtful = best_start(shots, config, folder, evidence)
     check_found(found, shots, config, folder)
     for model in found:
         adjust(model, shots, config)
-    models, more = told_apart(found, evidence)
+    models, more, weak = told_apart(found, evidence)
     if not models:
         known = "; its camera may be another (dataset.intrinsics=estimate)" if shots.is_calibrated else ""
         raise ValueError(
             "prior=multiview_stereo finds no structure that the images' matches agree with: what they show may repeat "
             f"(tiles, doors) or move{known}; or bring predictions (prior=files). {' '.join(more)}"
         )
-    return Mapped(models, said + more)
+    return Mapped(models, said + more, doubtful | weak)
 
 
 def best_start(shots: Shots, config: StructureConfig, folder: Path, evidence: Evidence) -> Mapped:
@@ -98,12 +99,12 @@ def best_start(shots: Shots, config: StructureConfig, folder: Path, evidence: Ev
         f"{', '.join(f'{100 * one:.0f}' for one in trusted)} % of what images near in time explain by themselves; kept "
         f"is that of {STARTS[taken].angle:g}{' without pairs far apart in time' * STARTS[taken].is_near}"
     )
-    return Mapped(best.models, [said, *best.said])
+    return Mapped(best.models, [said, *best.said], best.doubtful)
 
 
 def begin(number: int, shots: Shots, config: StructureConfig, folder: Path, evidence: Evidence) -> Mapped:
     """Map once, turn models that are inside out, and place images again that their matches contradict."""
-    models, said = [], []
+    models, said, doubtful = [], [], []
     folder = near_only(folder, evidence) if STARTS[number].is_near else folder
     for model in find_models(shots, config, folder, number):
         leave_out(model, evidence)
@@ -120,11 +121,18 @@ def begin(number: int, shots: Shots, config: StructureConfig, folder: Path, evid
                 f"structure: doubtful: a model of {model.num_reg_images()} images may be inside out, for its mirror "
                 "image explains the matches as well: move the camera farther, or nearer to what it shows"
             )
+            doubtful.append(turned.model)
         models.append(turned.model)
     register_rest(models, config, folder)
     for model in models:
         leave_out(model, evidence)
-    return Mapped([model for model in models if model.num_reg_images() >= MIN_IMAGES], said)
+    kept = [model for model in models if model.num_reg_images() >= MIN_IMAGES]
+    return Mapped(kept, said, names_in(doubtful))
+
+
+def names_in(models: Sequence[Any]) -> frozenset[str]:
+    """Names of the images with a pose in one of these models."""
+    return frozenset(model.images[image].name for model in models for image in model.reg_image_ids())
 
 
 def near_only(folder: Path, evidence: Evidence) -> Path:
@@ -162,7 +170,7 @@ def told_apart(found: Sequence[Any], evidence: Evidence) -> Mapped:
             )
         is_whole = [len(group) for group in groups] == [model.num_reg_images()]
         models += [model] if is_whole else [only(model, group) for group in groups]
-    believed = []
+    believed, doubtful = [], []
     for model in sorted(models, key=lambda model: -model.num_reg_images()):
         trusted, count = trust([model], evidence, within=True), model.num_reg_images()
         about = (
@@ -175,8 +183,9 @@ def told_apart(found: Sequence[Any], evidence: Evidence) -> Mapped:
             continue
         if trusted < WEAK:
             said.append(f"structure: doubtful: {about}")
+            doubtful.append(model)
         believed.append(model)
-    return Mapped(believed, said)
+    return Mapped(believed, said, names_in(doubtful))
 
 
 def refined_lens(shots: Shots, config: StructureConfig) -> tuple[bool, bool]:

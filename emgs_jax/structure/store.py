@@ -15,12 +15,13 @@ from filelock import FileLock
 from tqdm import tqdm
 
 from emgs_jax.data.base import BadFrameError
+from emgs_jax.data.masks import stem
 from emgs_jax.io.files import write_file
 from emgs_jax.structure import evidence, mapping, mirror, reconstruct
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import given_models, read_models, stems_of
 from emgs_jax.structure.library import load
-from emgs_jax.structure.mapping import tell
+from emgs_jax.structure.mapping import Mapped, tell
 from emgs_jax.structure.reconstruct import map_images
 from emgs_jax.structure.shots import Shots
 
@@ -62,7 +63,7 @@ def make_models(shots: Shots, config: StructureConfig, folder: Path | None) -> t
         models = given_models(Path(config.model).expanduser(), shots, config)
         key = hashlib.blake2b(repr([stems_of(model) for model in models]).encode(), digest_size=16).hexdigest()
         if folder is not None:
-            write_models(models, key, folder)
+            write_models(Mapped(models, []), key, folder)
         return key, models
     key = key_of(shots, config)
     places = places_of(key, folder)
@@ -110,8 +111,7 @@ def _made(shots: Shots, config: StructureConfig, key: str, places: Sequence[Path
             (work / "is_writable").touch()
         except OSError:
             continue
-        models, said = map_images(shots, config, work)
-        write_models(models, key, place, said)
+        write_models(map_images(shots, config, work), key, place)
         shutil.rmtree(work, ignore_errors=True)
         return place
     raise ValueError(f"no folder can be written: {', '.join(map(str, places))}; give hydra.run.dir=DIR")
@@ -125,16 +125,25 @@ def is_of(place: Path, key: str) -> bool:
         return False
 
 
-def write_models(models: Sequence[Any], key: str, place: Path, said: Sequence[str] = ()) -> None:
-    """Write models for COLMAP, a folder each, and last their key and what is to be said of them."""
+def write_models(mapped: Mapped, key: str, place: Path) -> None:
+    """Write models for COLMAP, a folder each, and last their key and what is to be known of them."""
     _clear(place)
-    for number, model in enumerate(models):
+    for number, model in enumerate(mapped.models):
         folder = place / str(number)
         folder.mkdir(exist_ok=True)
         model.write_binary(folder)
-    images = [model.num_reg_images() for model in models]
-    about = {"key": key, "pycolmap": load().__version__, "images": images, "said": [*said]}
+    images = [model.num_reg_images() for model in mapped.models]
+    about = {"key": key, "pycolmap": load().__version__, "images": images, "said": mapped.said}
+    about["doubtful"] = sorted(mapped.doubtful)
     write_file(place / ABOUT, json.dumps(about, indent=1).encode())
+
+
+def doubtful_in(folder: Path | None) -> set[str] | None:
+    """Names, without suffix, of the images of doubtful models in a run's `structure/`; None if that is not known."""
+    if folder is None or not (folder / ABOUT).is_file():
+        return None
+    names = json.loads((folder / ABOUT).read_text(encoding="utf-8")).get("doubtful")
+    return None if names is None else {*map(stem, names)}
 
 
 def copy_models(source: Path, place: Path) -> None:

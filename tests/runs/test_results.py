@@ -100,6 +100,18 @@ def test_the_trajectory_column_follows_the_alignment_and_quoted_rows_stand_besid
     assert line in full_table(rows)
 
 
+def test_sim3_and_se3_stand_side_by_side_and_a_scale_beside_its_uncertainty(tmp_path):
+    folder = write_result(tmp_path, 1.0, simulated=False, prior=None)
+    (row,) = average(read_estimates(tmp_path), each_sequence=False)
+    assert "| ATE Sim(3) [cm] | ATE SE(3) [cm] |" in full_table([row]) and "σ" not in full_table([row])
+    metrics = json.loads((folder / "metrics.json").read_text())
+    metrics |= {"prior/scale_std_percent": 2.51, "trajectory/scale_off_std": 1.24}
+    (folder / "metrics.json").write_text(json.dumps(metrics))
+    (row,) = average(read_estimates(tmp_path), each_sequence=False)
+    titles, _, line = ([word.strip() for word in text.split("|")] for text in full_table([row]).splitlines())
+    assert titles[-5:-2] == ["scale [%]", "scale ± [%]", "scale off [σ]"] and line[-4:-2] == ["2.5", "1.2"]
+
+
 def test_another_system_is_no_run_of_ours(tmp_path):
     write_result(tmp_path, 1.0, variant="mast3r_slam", simulated=False, prior=None)
     (row,) = average(read_estimates(tmp_path), each_sequence=False)

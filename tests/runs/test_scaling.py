@@ -9,15 +9,18 @@ import numpy as np
 import pytest
 from hand_run import random_poses
 from omegaconf import OmegaConf
+from scipy.spatial.transform import Rotation
 from written_run import written_run
 
 from emgs_jax import load_map
 from emgs_jax.config import configure
+from emgs_jax.geometry import Sim3
 from emgs_jax.io.mesh import save_mesh_ply
 from emgs_jax.io.ply import save_gaussians_ply, save_points_ply
-from emgs_jax.io.ply_reader import read_vertices, scale_ply
+from emgs_jax.io.ply_reader import read_vertices, transform_ply
 from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
-from emgs_jax.runs.export import factor_of, write_scaled
+from emgs_jax.prior.base import UP_KEYS
+from emgs_jax.runs.export import factor_of, measured_up, to_export, write_moved
 from emgs_jax.runs.finished_run import read_run
 from experiments.export import export_run
 
@@ -55,7 +58,7 @@ def exported(run, **values):
 def test_poses_map_and_clouds_grow_together_and_everything_else_stays(run, tmp_path):
     folder = tmp_path / "new"
     folder.mkdir()
-    scaled = write_scaled(run, folder, FACTOR)
+    scaled = write_moved(run, folder, Sim3.about(np.zeros(3), FACTOR))
     times, poses = load_trajectory_tum(folder / "trajectory.txt")
     np.testing.assert_array_equal(times, load_trajectory_tum(run.folder / "trajectory.txt")[0])
     np.testing.assert_allclose(poses[:, :3, 3], FACTOR * run.poses[run.is_placed, :3, 3], atol=1e-8)
@@ -70,19 +73,21 @@ def test_poses_map_and_clouds_grow_together_and_everything_else_stays(run, tmp_p
     np.testing.assert_allclose(online[1][:, :3, 3], FACTOR * online[0][:, :3, 3], atol=1e-8)
 
     # A scale shows in no image: pixels of all points from all cameras are the same.
-    def pixels(at):
-        cloud, (_, poses) = read_vertices(at / "points.ply"), load_trajectory_tum(at / "trajectory.txt")
-        points = np.stack([cloud[name] for name in "xyz"], 1).astype(float)
-        local = np.einsum("nji,npj->npi", poses[:, :3, :3], points - poses[:, None, :3, 3])
-        return local[..., :2] / local[..., 2:], local[..., 2] > 0.1
-
     (before, seen), (after, _) = pixels(run.folder), pixels(folder)
     np.testing.assert_allclose(after[seen], before[seen], atol=1e-5)
 
 
+def pixels(folder):
+    """Pixels of all points from all cameras, and which are in front."""
+    cloud, (_, poses) = read_vertices(folder / "points.ply"), load_trajectory_tum(folder / "trajectory.txt")
+    points = np.stack([cloud[name] for name in "xyz"], 1).astype(float)
+    local = np.einsum("nji,npj->npi", poses[:, :3, :3], points - poses[:, None, :3, 3])
+    return local[..., :2] / local[..., 2:], local[..., 2] > 0.1
+
+
 def test_a_ply_keeps_labels_comments_and_triangles(run, tmp_path):
     before, target = run.folder / "points.ply", tmp_path / "points.ply"
-    scale_ply(before, target, 2.0)
+    transform_ply(before, target, Sim3.about(np.zeros(3), 2.0))
     old, new = read_vertices(before), read_vertices(target)
     for name in old:
         np.testing.assert_array_equal(new[name], old[name] * (2 if name in "xyz" else 1), name)
@@ -92,13 +97,13 @@ def test_a_ply_keeps_labels_comments_and_triangles(run, tmp_path):
     assert (
         save_mesh_ply(tmp_path / "m.ply", grid, np.tile([0.0, 0, 1], (400, 1)), (grid, np.full((400, 3), 0.5))) is None
     )
-    scale_ply(tmp_path / "m.ply", tmp_path / "m2.ply", 2.0)
+    transform_ply(tmp_path / "m.ply", tmp_path / "m2.ply", Sim3.about(np.zeros(3), 2.0))
     faces = [path.read_bytes()[-130:] for path in (tmp_path / "m.ply", tmp_path / "m2.ply")]
     assert faces[0] == faces[1]
 
 
 def test_gaussians_of_a_ply_are_as_much_wider(run, tmp_path):
-    scale_ply(run.folder / "map.ply", tmp_path / "map.ply", FACTOR)
+    transform_ply(run.folder / "map.ply", tmp_path / "map.ply", Sim3.about(np.zeros(3), FACTOR))
     old, new = read_vertices(run.folder / "map.ply"), read_vertices(tmp_path / "map.ply")
     widths = np.exp([new[f"scale_{i}"][0] for i in range(3)])
     np.testing.assert_allclose(sorted(widths), FACTOR * np.array([0.05, 0.1, 0.2]), rtol=1e-5)
@@ -142,3 +147,65 @@ def test_frames_are_counted_as_frames_jsonl_counts_them(run):
     """Where unreadable images were left out, rows and numbers differ."""
     shifted = replace(run, frames=[{**frame, "index": frame["index"] + 10} for frame in run.frames])
     assert factor_of(shifted, [11, 15, 2.0]) == factor_of(run, [1, 5, 2.0])
+
+
+def covariances(path):
+    rows = read_vertices(path)
+    turns = Rotation.from_quat(np.stack([rows[f"rot_{i}"] for i in range(4)], 1), scalar_first=True).as_matrix()
+    widths = np.exp(np.stack([rows[f"scale_{i}"] for i in range(3)], 1).astype(float))
+    return np.einsum("nij,nj,nkj->nik", turns, widths**2, turns)
+
+
+def test_z_is_up_in_a_turned_export_of_all_files_alike_and_the_run_stays(run, capsys):
+    """Level cameras that look along z, y down, as those of the built-in room; oracle: the same pictures."""
+    times, _ = load_trajectory_tum(run.folder / "trajectory.txt")
+    tilt = Rotation.from_euler("x", 25, degrees=True)  # they look down
+    level = np.tile(np.eye(4), (len(times), 1, 1))
+    for row in range(len(times)):
+        level[row, :3, :3] = (Rotation.from_euler("y", 20 * row, degrees=True) * tilt.inv()).as_matrix()
+        level[row, :3, 3] = [0.3 * row, 0.02 * row, 0.1 * row]
+    save_trajectory_tum(run.folder / "trajectory.txt", times, level)
+    before = {path.name: path.read_bytes() for path in run.folder.iterdir()}
+    exported(run, up="z", formats=["nerfstudio", "frustums"])
+    assert {name: (run.folder / name).read_bytes() for name in before} == before
+    assert "z is up" in capsys.readouterr().out
+    folder = run.folder / "upright"
+    T = np.array(json.loads((folder / "T_export_map.json").read_text())["T_export_map"])
+    np.testing.assert_allclose(T[:3, :3] @ [0.0, -1.0, 0.0], [0.0, 0.0, 1.0], atol=0.03)
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-9)
+    _, poses = load_trajectory_tum(folder / "trajectory.txt")
+    np.testing.assert_allclose(poses, T @ level, atol=1e-6)
+    frames = json.loads((folder / "nerfstudio" / "transforms.json").read_text())["frames"]
+    np.testing.assert_allclose([frame["transform_matrix"][2][3] for frame in frames], poses[:, 2, 3], atol=1e-6)
+    (old, seen), (new, _) = pixels(run.folder), pixels(folder)
+    np.testing.assert_allclose(new[seen], old[seen], atol=1e-4)
+    clouds = [read_vertices(at / "points.ply") for at in (run.folder, folder)]
+    normals = [np.stack([cloud[name] for name in ("nx", "ny", "nz")], 1) for cloud in clouds]
+    np.testing.assert_allclose(normals[1], normals[0] @ T[:3, :3].T, atol=1e-5)
+    for name in ("map.ply", "points.ply", "cameras.ply"):
+        assert (b"comment z is up\n" in (folder / name).read_bytes()[:2000]) == (name != "cameras.ply")
+    turned, own = (covariances(at / "map.ply") for at in (folder, run.folder))
+    np.testing.assert_allclose(turned, T[:3, :3] @ own @ T[:3, :3].T, atol=1e-6)
+    map = load_map(folder / "map.npz")
+    valid = np.asarray(map.gaussians.valid)
+    np.testing.assert_allclose(
+        np.asarray(map.gaussians.means)[valid], np.asarray(run.map.gaussians.means)[valid] @ T[:3, :3].T, atol=1e-5
+    )
+
+
+def test_up_is_that_of_the_source_which_told_the_scale(run):
+    """Known in the first camera's axes, whatever cameras and walls say."""
+    up = np.array([0.6, 0.0, 0.8])
+    known = replace(run, metrics=run.metrics | dict(zip(UP_KEYS, map(float, run.poses[0, :3, :3].T @ up), strict=True)))
+    np.testing.assert_allclose(measured_up(known), up, atol=1e-9)
+    np.testing.assert_allclose(to_export(known, None, "z").rotation @ up, [0.0, 0.0, 1.0], atol=1e-9)
+    assert measured_up(run) is None and to_export(known, None, "run") is None
+
+
+def test_a_turned_export_can_have_another_unit_too(run):
+    exported(run, up="z", scale=2.0, formats=[])
+    T = np.array(json.loads((run.folder / "scaled" / "T_export_map.json").read_text())["T_export_map"])
+    assert np.linalg.det(T[:3, :3]) == pytest.approx(8.0)
+    assert not (run.folder / "upright").exists()
+    with pytest.raises(ValueError, match="up must be one of run, z"):
+        exported(run, up="y", formats=[])

@@ -9,6 +9,7 @@ from scene import compose
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.config.configure import build, build_dataset, build_prior
+from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.metres import ScaleConfig, View, metres_of
 
 UNIT, HEIGHT, FOCAL, SIZE = 0.4, 1.5, 60.0, (80, 60)  # units of a metre; metres
@@ -97,6 +98,19 @@ def test_a_distance_between_pixels_of_the_image_on_disk(tmp_path):
     assert found.scale.source.startswith("distance in a03.jpg (± ")
 
 
+def test_a_distance_where_frames_disagree_is_less_sure(tmp_path):
+    """The frame of the tape is 20 % too near in all its depths, and says 2 %."""
+
+    def wrong(frame):
+        points, std = view(frame)
+        return View((0.8 if frame == 3 else 1.0) * points, std)
+
+    (right,) = measured(tmp_path, ScaleConfig(distance=tape()))
+    (found,) = metres_of(ScaleConfig(distance=tape()), Photos(tmp_path), *structure(), wrong)
+    assert found.scale.log - right.scale.log == pytest.approx(-np.log(0.8), rel=0.05)
+    assert right.scale.std < 0.045 and found.scale.std > 0.2
+
+
 def test_several_distances_are_more_certain(tmp_path):
     (one,), (three,) = (
         measured(tmp_path, ScaleConfig(distance=given))
@@ -119,6 +133,14 @@ def test_positions_give_scale_and_up(tmp_path):
     assert found.scale.factor == pytest.approx(1 / UNIT, rel=1e-4) and angle(found.up) < 0.1
 
 
+def test_poses_of_the_data_set_give_scale_and_up(tmp_path):
+    dataset = Photos(tmp_path)
+    dataset.name, dataset.pose = "photos", lambda index: None if index == 4 else poses()[index]
+    (found,) = metres_of(ScaleConfig(positions="dataset"), dataset, *structure(), view)
+    assert found.scale.factor == pytest.approx(1 / UNIT, rel=1e-4) and angle(found.up) < 0.1
+    assert "11 positions fit" in found.notes[0]
+
+
 def test_sources_that_disagree_are_said(tmp_path):
     length = tape()[-1]
     (found,) = measured(tmp_path, ScaleConfig(distance=tape(metres=2 * length), height=HEIGHT))
@@ -133,6 +155,19 @@ def test_each_model_has_its_own_scale(tmp_path):
     assert "image a03.jpg of scale.distance has no pose in this model" in second.notes
     with pytest.raises(ValueError, match=r"^scale: image a03.jpg of scale.distance has no pose in this model$"):
         measured(tmp_path, config, world=[0] * 3 + [-1] + [0] * 8)
+
+
+def test_a_tape_outweighs_a_network_which_alone_gives_its_scale(tmp_path):
+    network = Scale("the depth network", np.log(1.3 / UNIT), 0.2)
+    world = [0] * 6 + [1] * 6
+    given = Photos(tmp_path), *structure(world), view, [network, network]
+    both = metres_of(ScaleConfig(distance=tape()), *given)
+    (by_tape,) = metres_of(ScaleConfig(distance=tape()), Photos(tmp_path), *structure([0] * 12), view)
+    assert both[0].scale.factor == pytest.approx(1 / UNIT, rel=0.02) and both[0].scale.std < by_tape.scale.std < 0.045
+    assert both[1].scale.factor == pytest.approx(1.3 / UNIT) and both[1].scale.std == pytest.approx(0.2)
+    assert both[0].scale.source.endswith("the depth network (± 20.0 %)")
+    alone = metres_of(ScaleConfig(), *given)
+    assert [one.scale.factor for one in alone] == pytest.approx([1.3 / UNIT] * 2)
 
 
 def test_pixels_without_depth_and_images_not_in_use_are_named(tmp_path):

@@ -5,7 +5,7 @@ import pytest
 from PIL import ExifTags, Image
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.scale.positions import positions_of_exif, read_positions, scale_of_positions
+from emgs_jax.scale.positions import positions_of_exif, positions_of_poses, read_positions, scale_of_positions
 
 NAMES = [f"DJI_{index:04}" for index in range(5)]
 
@@ -48,6 +48,15 @@ def test_south_and_below_the_sea_are_negative(tmp_path):
 def test_photos_without_gps_are_an_error(tmp_path):
     with pytest.raises(ValueError, match="0 of 2 images have a GPS position"):
         positions_of_exif([photo(tmp_path / "a.jpg"), photo(tmp_path / "b.jpg")])
+
+
+def test_poses_of_a_data_set_are_positions():
+    pose = np.eye(4)
+    pose[:3, 3] = [1.0, 2.0, 3.0]
+    found = positions_of_poses([pose, None, pose, pose, pose], "tum")
+    assert (found[[0, 2]] == [1, 2, 3]).all() and np.isnan(found[1]).all()
+    with pytest.raises(ValueError, match="scale.positions=dataset: 1 of 2 frames of photos have a pose, and 4"):
+        positions_of_poses([None, pose], "photos")
 
 
 def test_positions_by_name(tmp_path):

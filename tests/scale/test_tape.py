@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from emgs_jax.scale.tape import point_at, scale_of_distance
+from emgs_jax.scale.tape import pixel_in, point_at, scale_of_distance, spread_of
 
 FOCAL = 300.0
 
@@ -55,3 +55,19 @@ def test_an_edge_is_less_sure():
 
 def test_no_depth_near_a_pixel_is_no_point():
     assert point_at(np.zeros((20, 30, 3)), np.ones((20, 30)), np.array([3.0, 3.0])) is None
+
+
+def test_a_point_is_seen_where_the_camera_looks():
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [1.0, 0.0, 0.5]  # looks along the world's x
+    pixel, depth = pixel_in(np.array([3.0, -0.4, 0.1]), T, (100.0, 200.0, 50.0, 40.0))
+    assert pixel == pytest.approx([100 * 0.4 / 2 + 50, 200 * 0.4 / 2 + 40]) and depth == 2.0
+    behind = pixel_in(np.array([0.0, 0.0, 0.5]), T, (100.0, 200.0, 50.0, 40.0))
+    assert behind[1] == -1.0 and np.isnan(behind[0]).all()
+
+
+def test_frames_that_disagree_make_a_depth_less_sure():
+    """Symptom: one distance in ten was 18 % off, at ends whose depth was said to be right to 2 %."""
+    agreed = spread_of([2.0, 2.0, 1.0], [2.02, 1.99, 0.4])
+    assert agreed == pytest.approx(1.4826 * np.log(1.01)), "one behind another surface does not count"
+    assert spread_of([2.0, 2.0, 2.0], [3.0, 1.5, 2.9]) > 0.4 and spread_of([], []) == 0.0

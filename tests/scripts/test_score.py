@@ -14,7 +14,7 @@ from emgs_jax.io.ply import save_points_ply
 from emgs_jax.io.trajectory import save_trajectory_tum
 from emgs_jax.report.tables import average, full_table
 from emgs_jax.runs.results import read_estimates
-from experiments.score import coverage, score
+from experiments.score import coverage, score, unit_note
 
 pytestmark = pytest.mark.slow
 
@@ -61,6 +61,15 @@ def test_without_scale_the_error_of_the_scale_is_seen(tmp_path, truth):
     metrics, _ = scored(*write_system(tmp_path, *truth), "evaluation.alignment=se3")
     assert metrics["trajectory/ate_sim3_m"] < 1e-6 < 0.01 < metrics["trajectory/ate_se3_m"]
     assert metrics["reconstruction/accuracy_m"] > 0.1
+
+
+@pytest.mark.parametrize(
+    ("scale", "words"), [(1.02e-3, "in millimetres"), (0.0099, "in centimetres"), (980.0, "in kilometres"), (0.4, "")]
+)
+def test_a_path_in_another_unit_is_said_where_metres_are_scored(scale, words):
+    note = unit_note({"trajectory/scale": scale}, "se3")
+    assert words in note and bool(words) == note.startswith("warning: the path is")
+    assert unit_note({"trajectory/scale": scale}, "sim3") == "" == unit_note({"trajectory/scale": None}, "se3")
 
 
 def test_the_table_of_an_evaluation_shows_the_other_system_under_its_name(tmp_path, truth):

@@ -89,7 +89,7 @@ def test_images_that_no_agreeing_match_joins_are_models_of_their_own_and_it_is_s
         own=evidence.own[keep],
         is_near=evidence.is_near[keep],
     )
-    models, said = told_apart([moved], cut)
+    models, said, *_ = told_apart([moved], cut)
     assert [sorted(one.reg_image_ids()) for one in models] == [images[: NUM // 2], images[NUM // 2 :]]
     assert len(said) == 1 and "a model of 12 images is split into 2 (of 6, 6)" in said[0]
 
@@ -97,7 +97,9 @@ def test_images_that_no_agreeing_match_joins_are_models_of_their_own_and_it_is_s
 def test_a_model_that_explains_little_is_doubtful(scene):
     model, evidence, _ = scene
     wrong = turn(model, sorted(model.reg_image_ids())[2], 0.4)  # 3.5 pixels
-    models, said = told_apart([wrong], evidence)
+    models, said, doubtful = told_apart([wrong], evidence)
+    assert doubtful == {image.name for image in wrong.images.values()}
+    assert told_apart([model], evidence).doubtful == frozenset()
     assert models == [wrong] and len(said) == 1 and "doubtful: a model of 12 images explains" in said[0]
 
 
@@ -170,7 +172,7 @@ def test_a_weak_start_is_followed_by_others_and_the_best_is_kept_and_said(scene,
         return mapping.Mapped([turn(model, sorted(model.reg_image_ids())[2], angle)], [f"of {number}"])
 
     monkeypatch.setattr(mapping, "begin", begin)
-    best, said = mapping.best_start(shots([None] * NUM), structure_config(), folder, evidence)
+    best, said, _ = mapping.best_start(shots([None] * NUM), structure_config(), folder, evidence)
     assert begun == [0, 1, 2] and explained(best[0], evidence) > 0.95
     assert "begun 3 times" in said[0] and "kept is that of 4" in said[0] and said[1:] == ["of 2"]
 
@@ -178,7 +180,7 @@ def test_a_weak_start_is_followed_by_others_and_the_best_is_kept_and_said(scene,
 def test_a_strong_start_is_the_only_one(scene, monkeypatch):
     model, evidence, folder = scene
     monkeypatch.setattr(mapping, "begin", lambda number, *_: mapping.Mapped([model] if number == 0 else [], []))
-    assert mapping.best_start(shots([None] * NUM), structure_config(), folder, evidence) == ([model], [])
+    assert mapping.best_start(shots([None] * NUM), structure_config(), folder, evidence) == ([model], [], frozenset())
 
 
 @pytest.mark.slow
@@ -186,7 +188,7 @@ def test_the_map_of_a_database_is_right(scene, tmp_path):
     model, _, folder = scene
     (tmp_path / DATABASE).write_bytes((folder / DATABASE).read_bytes())
     taken = shots([None] * NUM)._replace(size=(640, 480))
-    models, said = map_database(taken, structure_config(), tmp_path)
+    models, said, *_ = map_database(taken, structure_config(), tmp_path)
     assert models[0].num_reg_images() == NUM and said == []
     assert model.num_reg_images() == NUM
 
@@ -196,13 +198,13 @@ def test_models_that_their_matches_do_not_bear_out_or_of_a_few_points_are_left_o
     few = copy.deepcopy(model)
     for key in sorted(few.points3D)[14:]:
         few.delete_point3D(key)
-    models, said = told_apart([few], evidence)
+    models, said, *_ = told_apart([few], evidence)
     assert models == [] and "12 of 12 images of a model are left out" in said[0]
     few = only(turn(model, 3, 0.4), sorted(model.reg_image_ids())[:6])
-    models, said = told_apart([few], evidence)  # doubtful, and small
+    models, said, *_ = told_apart([few], evidence)  # doubtful, and small
     assert models == [] and "a model of 6 images explains" in said[0] and "it is left out" in said[0]
     bent = model
     for image in sorted(model.reg_image_ids()):
         bent = turn(bent, image, 0.5 * image)  # 4 pixels
-    models, said = told_apart([bent], evidence)
+    models, said, *_ = told_apart([bent], evidence)
     assert models == [] and "it is left out" in said[-1]

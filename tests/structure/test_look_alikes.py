@@ -33,7 +33,7 @@ def test_doors_that_look_alike_are_not_taken_for_each_other(tmp_path):
     """One start with all pairs has all 30 images, and an error of 30 % of the path."""
     shots, truth = corridor("doors")
     config = structure_config()
-    models, said = map_images(shots, config, tmp_path)
+    models, said, *_ = map_images(shots, config, tmp_path)
     assert models[0].num_reg_images() == 30 and error(models[0], shots.names, truth) < 0.01
     assert "begun 2 times" in said[0] and "without pairs far apart in time" in said[0]
     first = find_models(shots, config, tmp_path)
@@ -44,7 +44,7 @@ def test_doors_that_look_alike_are_not_taken_for_each_other(tmp_path):
 def test_of_white_tiles_what_is_placed_is_right_or_nothing_is(tmp_path):
     shots, truth = corridor("tiles")
     try:
-        models, said = map_images(shots, structure_config(), tmp_path)
+        models, said, *_ = map_images(shots, structure_config(), tmp_path)
     except ValueError as refused:
         assert "finds no structure" in str(refused)
         return

@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 from stereo_scene import shots, structure_config
 
 from emgs_jax.structure.given import given_models, read_models
-from emgs_jax.structure.mapping import drop_points_at_cameras
+from emgs_jax.structure.mapping import Mapped, drop_points_at_cameras
 from emgs_jax.structure.model import NONE, stem, to_structure
 from emgs_jax.structure.shots import DATABASE
-from emgs_jax.structure.store import make_models, write_models
+from emgs_jax.structure.store import doubtful_in, make_models, write_models
 from emgs_jax.structure.uncertainty import camera_in_world
 
 NUM_FRAMES = 8
@@ -111,7 +111,8 @@ def test_a_model_is_taken_from_a_folder_numbered_folders_text_and_a_runs_own(tmp
     whole.write_text(tmp_path / "text")
     part(whole, (0, 1, 2)).write_binary(tmp_path / "several/0")
     part(whole, range(3, 8)).write_binary(tmp_path / "several/1")
-    write_models([part(whole, (0, 1, 2))], "key", tmp_path / "structure")
+    write_models(Mapped([part(whole, (0, 1, 2))], [], frozenset({"000001.png"})), "key", tmp_path / "structure")
+    assert doubtful_in(tmp_path / "structure") == {"000001"} and doubtful_in(tmp_path) is None is doubtful_in(None)
     for name, counts in (("one", [8]), ("text", [8]), ("several", [5, 3]), ("structure", [3])):
         assert [model.num_reg_images() for model in models(tmp_path / name)] == counts
     config = structure_config(f"prior.structure.model={tmp_path}/one")

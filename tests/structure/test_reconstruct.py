@@ -96,7 +96,7 @@ def test_what_was_found_before_a_call_was_interrupted_is_gone_on_with(tmp_path, 
     with pytest.raises(KeyboardInterrupt):
         map_images(twelve, config, tmp_path)
     read.clear()
-    models, _ = map_images(
+    models, *_ = map_images(
         twelve._replace(read=lambda index: read.append(index) or images[index % 8]), config, tmp_path
     )
     assert read == [8, 9] and models[0].num_reg_images() >= 8

@@ -1,6 +1,6 @@
 """Types shared by the methods for dense depth of views with known poses."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -11,6 +11,7 @@ from emgs_jax.ops.camera import Camera
 from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.depth_noise import DepthNoiseConfig
 from emgs_jax.prior.multiview.lens import Lens
+from emgs_jax.scale.estimate import Scale
 from emgs_jax.structure.model import Structure
 
 
@@ -49,8 +50,8 @@ Depths = Callable[[int], Depth]  # of a frame that the structure has placed
 class Way:
     """A method for dense depth."""
 
-    # The newest structure, maybe in another unit, and the frames' depths.
-    begin: Callable[[Scene], tuple[Callable[[], Structure], Depths]]
+    # The frames' depths, and the scale of each world by depths in metres, None where they say nothing.
+    begin: Callable[[Scene], tuple[Depths, Sequence[Scale | None]]]
     check: Callable[[Dataset], None] = lambda dataset: None  # raises ValueError if it does not fit a data set
     needs_all: bool = False  # one fit to all frames, which an online structure does not have
     contents: Mapping[str, Any] = field(default_factory=dict)  # digest of its files, for provenance

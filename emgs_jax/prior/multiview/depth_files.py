@@ -23,7 +23,7 @@ from emgs_jax.prior.files.view import Camera, View, check_metres, whole_image
 from emgs_jax.prior.multiview.dense import Depths, Scene, Way
 from emgs_jax.prior.multiview.lens import rectify
 from emgs_jax.prior.multiview.monocular import MonocularConfig, begin_monocular
-from emgs_jax.structure.model import Structure
+from emgs_jax.scale.estimate import Scale
 
 SUFFIXES = (".npz", ".npy", ".pfm", ".exr", ".png")  # the first that exists is read
 KEYS = ("depth", "depths", "disparity", "disparities", "inverse_depth", "prediction")  # of an .npz with several arrays
@@ -59,7 +59,7 @@ def way_of_files(config: DepthFilesConfig) -> Way:
         if config.kind == "metric" and np.isfinite(values).any():
             check_metres(float(np.nanmedian(values)), str(found.files[0]), IN_METRES)
 
-    def begin(scene: Scene) -> tuple[Callable[[], Structure], Depths]:
+    def begin(scene: Scene) -> tuple[Depths, Sequence[Scale | None]]:
         read = _reader(scene.dataset, found, folder)
 
         def values(frame: int) -> np.ndarray:

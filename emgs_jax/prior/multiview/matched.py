@@ -1,6 +1,6 @@
 """Depth of a view by matching it with others: choose them, and cache what is kept of them."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
@@ -16,6 +16,7 @@ from emgs_jax.prior.multiview.dense import DenseConfig, Depth, Depths, Scene, tr
 from emgs_jax.prior.multiview.depth import pixels_per_log_depth
 from emgs_jax.prior.multiview.lens import Lens
 from emgs_jax.prior.sources import Sources, choose, parallax, placed_beside, sources_of
+from emgs_jax.scale.estimate import Scale
 from emgs_jax.structure.model import Structure
 
 jitted_pixels = eqx.filter_jit(pixels_per_log_depth)
@@ -39,8 +40,8 @@ class Stereo(NamedTuple):
     estimate: Callable[[Any, Sources, Float[Array, "2"], Camera], tuple[np.ndarray, np.ndarray]]
 
 
-def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[Callable[[], Structure], Depths]:
-    """Begin depth of each frame by stereo with its sources."""
+def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[Depths, Sequence[Scale]]:
+    """Begin depth of each frame by stereo with its sources, which tells no scale."""
 
     @lru_cache(NUM_KEPT)
     def view(frame: int) -> Any:
@@ -59,7 +60,7 @@ def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[
         pixels = jitted_pixels(jnp.asarray(depth), sources._replace(views=None), scene.camera)
         return Depth(depth, spread, np.asarray(pixels))
 
-    return scene.newest, depth_of
+    return depth_of, ()
 
 
 def chosen(found: Structure, frame: int, config: MatchedConfig) -> list[int]:

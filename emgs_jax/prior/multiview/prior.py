@@ -21,10 +21,10 @@ import numpy as np
 from tqdm import tqdm
 
 from emgs_jax.data.base import Dataset, Frame, wait_for_all
-from emgs_jax.data.masks import check_names
+from emgs_jax.data.masks import check_names, names_of
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
-from emgs_jax.prior.base import DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
+from emgs_jax.prior.base import UP_KEYS, DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
 from emgs_jax.prior.multiview.dense import DenseConfig, Depth, Scene, Way
 from emgs_jax.prior.multiview.depth import mean_difference
 from emgs_jax.prior.multiview.depth_files import DepthFilesConfig, way_of_files
@@ -35,11 +35,13 @@ from emgs_jax.prior.multiview.matched import begin_matched
 from emgs_jax.prior.multiview.monocular_network import MeterConfig, way_of_meter
 from emgs_jax.prior.multiview.swept import SweptConfig, swept
 from emgs_jax.prior.sources import placed_beside, sources_of
+from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.metres import ScaleConfig, View, metres_of
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import names_at
 from emgs_jax.structure.model import NONE, Structure, median_depth, scaled
 from emgs_jax.structure.sequence import follow_images, structure_of
+from emgs_jax.structure.store import doubtful_in
 
 jitted_difference = eqx.filter_jit(mean_difference)
 NUM_KEPT = 64  # frames whose depths are cached
@@ -92,6 +94,7 @@ class MultiviewStereo(Prior):
         self._lenses: dict[tuple, Lens] = {}
         self._num_adjusted = 0
         self._scale_std: float | None = None
+        self._up: np.ndarray | None = None  # in the axes of the first frame with a pose
 
     def num_newer(self, window_size: int) -> int:
         """All but one: a structure knows all images, so the first frame alone begins the map. None online."""
@@ -118,12 +121,21 @@ class MultiviewStereo(Prior):
             self._take(0)
 
     def report(self) -> dict[str, float]:
-        """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models, and, in
-        metres by `scale=`, `prior/scale_std_percent`."""
+        """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models.
+
+        Of models that were made here also `prior/doubtful_percent`: frames of those that are said to be doubtful.
+        In metres also `prior/scale_std_percent`, and `prior/up_x`, y, z, see `UP_KEYS`, if a source tells up.
+        """
         if self._known is None:
             return {}
         placed = 100 * float(self._known.is_placed.mean())
         known = {} if self._scale_std is None else {"prior/scale_std_percent": 100 * self._scale_std}
+        is_own = self._config.model is None and not self._config.online
+        doubtful = doubtful_in(self._folder) if is_own else None
+        if doubtful is not None:
+            is_doubtful = [name in doubtful for name in names_of(self._dataset)]
+            known["prior/doubtful_percent"] = 100 * float(np.mean(self._known.is_placed & is_doubtful))
+        known |= {} if self._up is None else dict(zip(UP_KEYS, map(float, self._up), strict=True))
         return {"prior/placed_percent": placed, "prior/num_worlds": len(self._known.worlds)} | known
 
     @property
@@ -177,10 +189,11 @@ class MultiviewStereo(Prior):
             self._camera = Camera(np.float32(intrinsics[:2]), np.float32(intrinsics[2:]), width, height)
             self._up_to, self._is_straight = self._begin()
             self._known = self._up_to(frame)
-            self._newest, depths = self._way.begin(Scene(self._dataset, lambda: self._known, self._lens, self._camera))
+            self._newest = lambda: self._known
+            depths, scales = self._way.begin(Scene(self._dataset, self._newest, self._lens, self._camera))
             self._depths = lru_cache(NUM_KEPT)(depths)  # a frame's neighbours ask for its depth again
-            if self._metres.is_given:
-                self._to_metres(self._newest())
+            if self._metres.is_given or any(scales):
+                self._to_metres(self._newest(), scales)
         self._known = self._up_to(frame)
         return self._newest()
 
@@ -194,14 +207,19 @@ class MultiviewStereo(Prior):
         found, is_straight = structure_of(self._dataset, self._config, self._folder)
         return lambda frame: found, is_straight
 
-    def _to_metres(self, found: Structure) -> None:
-        """Bring structure and depths into metres by the lengths that are known; other worlds keep their unit."""
+    def _to_metres(self, found: Structure, scales: Sequence[Scale | None]) -> None:
+        """Bring structure and depths into metres by the lengths that are known; other worlds keep their unit.
+
+        Args:
+            scales: of each world, by depths in metres; empty without such.
+        """
 
         def view(frame: int) -> View:
             points, confidence, _ = self._answer(frame)
             return View(points, 1.0 / confidence)
 
-        each, depths = metres_of(self._metres, self._dataset, found.T_world_camera, found.world, view), self._depths
+        each = metres_of(self._metres, self._dataset, found.T_world_camera, found.world, view, scales)
+        depths = self._depths
         factors = np.ones(len(each))
         for world, (scale, _, notes) in enumerate(each):
             of = f" of model {world}" if len(each) > 1 else ""
@@ -209,6 +227,8 @@ class MultiviewStereo(Prior):
             tqdm.write(f"scale{of}: {'; '.join([*said, *notes])}")
             factors[world] = 1.0 if scale is None else scale.factor
         self._scale_std = next(scale.std for scale, *_ in each if scale is not None)
+        if each[0].up is not None:  # worlds are in the order of their first frames
+            self._up = found.T_world_camera[np.flatnonzero(found.is_placed)[0], :3, :3].T @ each[0].up
         in_metres = scaled(found, factors)
 
         def depth_in_metres(frame: int) -> Depth:

@@ -171,7 +171,7 @@ def room(factor=1.0):
 
 
 @pytest.mark.parametrize("kind", ["metric", "up_to_scale", "affine", "affine_inverse"])
-def test_depths_of_the_room_come_back_in_the_unit_of_the_structure_or_in_metres(tmp_path, kind):
+def test_depths_of_the_room_come_back_in_the_unit_of_the_structure_with_the_scale_of_metres(tmp_path, kind):
     drawn, found, camera, frames = room(factor=0.4)
     for index, frame in enumerate(frames):
         y = 1 / frame.depth if kind == "affine_inverse" else frame.depth
@@ -180,18 +180,17 @@ def test_depths_of_the_room_come_back_in_the_unit_of_the_structure_or_in_metres(
     lens = Lens(camera.focal, camera.center)
     way = way_of_files(config(tmp_path, kind))
     way.check(drawn)
-    newest, depth_of = way.begin(Scene(drawn, lambda: found, lambda world: lens, camera))
-    structure = newest()
-    factor = 1.0 if kind == "metric" else 0.4
-    np.testing.assert_allclose(
-        structure.T_world_camera[-1, :3, 3], factor / 0.4 * found.T_world_camera[-1, :3, 3], rtol=1e-2
-    )
+    depth_of, scales = way.begin(Scene(drawn, lambda: found, lambda world: lens, camera))
+    assert len(scales) == (kind == "metric")
+    for scale in scales:
+        assert scale.factor == pytest.approx(1 / 0.4, rel=1e-2) and scale.source == "the depth network"
+        assert 0.2 < scale.std < 0.25, "the frames agree, and the bias of the scene stays"
     for index, frame in enumerate(frames):
         depth, std, _, scale_std = depth_of(index)
         assert 0 < scale_std < 0.05  # of a scale that landmarks tell
         is_known = depth > 0
         assert is_known.mean() > 0.9
-        ratio = depth[is_known] / frame.depth[is_known] / factor
+        ratio = depth[is_known] / frame.depth[is_known] / 0.4
         assert abs(np.median(ratio) - 1) < 0.01 and np.percentile(np.abs(ratio - 1), 90) < 0.02
         assert std[is_known].max() < 0.1
 

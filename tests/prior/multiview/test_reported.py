@@ -1,0 +1,70 @@
+"""What `multiview_stereo` reports of its structure, in metres or not; the structure is drawn by hand."""
+
+import json
+
+import numpy as np
+import pytest
+from scene import compose
+
+from emgs_jax.config.configure import build
+from emgs_jax.prior.base import UP_KEYS
+from emgs_jax.prior.multiview import prior as module
+from emgs_jax.scale.estimate import Scale
+from emgs_jax.scale.metres import Metres
+from emgs_jax.structure.model import NONE, Structure, World
+
+TURN = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])  # of the first camera with a pose
+UP = np.array([0.0, 0.6, 0.8])
+
+
+class Photos:
+    """Four frames `p0.jpg` …"""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __len__(self):
+        return 4
+
+    def files(self, index):
+        return [self.folder / f"p{index}.jpg"]
+
+
+def drawn():
+    """The first frame has no pose."""
+    T = np.full((4, 4, 4), np.nan)
+    T[1:] = np.eye(4)
+    T[1, :3, :3] = TURN
+    worlds = [World(np.zeros((0, 3)), None)]
+    return Structure(worlds, np.array([NONE, 0, 0, 0]), T, np.zeros((4, 6, 6)), [np.zeros(0, int)] * 4)
+
+
+def begun(folder, *words):
+    prior = build(compose("prior=multiview_stereo", *words), "prior")
+    prior._dataset, prior._folder, prior._known = Photos(folder), folder / "structure", drawn()
+    prior._depths = lambda frame: None
+    return prior
+
+
+def test_up_by_a_source_of_the_scale_is_reported_in_the_first_cameras_axes(tmp_path, monkeypatch):
+    prior = begun(tmp_path, "scale.height=1.5")
+    assert {"prior/scale_std_percent", *UP_KEYS}.isdisjoint(prior.report())
+    for up in (None, UP):
+        found = Metres(Scale("height", np.log(2.0), 0.03), up, ())
+        monkeypatch.setattr(module, "metres_of", lambda *given, found=found: [found])
+        prior._to_metres(drawn(), ())
+        report = prior.report()
+        assert report["prior/scale_std_percent"] == pytest.approx(3.0)
+        assert (UP_KEYS[0] in report) == (up is not None)
+    np.testing.assert_allclose(TURN @ [report[key] for key in UP_KEYS], UP)
+
+
+@pytest.mark.parametrize(("doubtful", "percent"), [(["p1.png", "p3.png", "p0.png"], 50.0), ([], 0.0), (None, None)])
+def test_frames_of_a_doubtful_model_are_counted(tmp_path, doubtful, percent):
+    """p0 has no pose; structures of earlier versions do not say which images are doubtful."""
+    about = {"key": "k", "said": []} | ({} if doubtful is None else {"doubtful": doubtful})
+    (tmp_path / "structure").mkdir()
+    (tmp_path / "structure" / "structure.json").write_text(json.dumps(about))
+    assert begun(tmp_path).report().get("prior/doubtful_percent") == percent
+    given = begun(tmp_path, "prior.structure.model=elsewhere")
+    assert "prior/doubtful_percent" not in given.report()
