@@ -16,7 +16,8 @@ from tqdm import tqdm
 
 from emgs_jax.config.configure import build, message_of
 from emgs_jax.config.overrides import written
-from emgs_jax.data.intrinsics import from_numbers
+from emgs_jax.data.camera_models import Calibration
+from emgs_jax.data.intrinsics import Pictures, from_numbers
 from emgs_jax.io.files import owned
 from emgs_jax.report.page import write_report
 from emgs_jax.runs.files import claim_folder
@@ -36,14 +37,13 @@ def cut(count: int, chunks: int, overlap: int) -> list[range]:
     """
     if not (isinstance(chunks, int) and isinstance(overlap, int) and chunks > 1 and overlap > 0):
         raise ValueError(f"chunks must be 2 or more and overlap 1 or more, whole numbers, got {chunks} and {overlap}")
-    step = (count - overlap) / chunks
-    if step < overlap:
+    if (count - overlap) // chunks < overlap:
         most = count // overlap - 1
         raise ValueError(
-            f"chunks={chunks} overlap={overlap} would leave {max(int(step), 0)} new frames for each chunk of the "
-            f"{count}, fewer than it shares: " + (f"give chunks={most} or fewer" if most > 1 else "give a longer walk")
+            f"chunks={chunks} overlap={overlap} would leave each chunk of the {count} frames fewer new ones than it "
+            "shares: " + (f"give chunks={most} or fewer" if most > 1 else "give a longer walk")
         )
-    begins = [round(number * step) for number in range(chunks + 1)]
+    begins = [number * (count - overlap) // chunks for number in range(chunks + 1)]
     return [range(begin, end + overlap) for begin, end in zip(begins, begins[1:], strict=False)]
 
 
@@ -75,7 +75,10 @@ def run_chunks(
             raise ValueError("\n       ".join([*problems, "so there is nothing to join"]))
         read = [mergeable(folders[row]) for row in range(len(parts)) if row not in left]
         tqdm.write(f"joining {len(read)} chunks …")
-        joined = merged(read, has_truth=True)
+        try:
+            joined = merged(read, has_truth=True)
+        except ValueError as error:
+            raise ValueError("\n       ".join([*problems, str(error)])) from error
         for note in claim_folder(folder):
             tqdm.write(note)
         metrics, notes = save_merged(folder, read, joined, has_truth=True)
@@ -99,16 +102,14 @@ def check(config: DictConfig) -> None:
 
 def num_frames(config: DictConfig) -> int:
     """Count the frames that the keys of the data set choose, without estimating intrinsics for it."""
-    given = {}
-    if config.dataset.get("intrinsics") == "estimate":
-        given["intrinsics"] = lambda pictures: (from_numbers(plausible(pictures.size)), {})
-    return len(build(config, "dataset", **given))
+    if config.dataset.get("intrinsics") != "estimate":
+        return len(build(config, "dataset"))
 
+    def any_camera(pictures: Pictures) -> tuple[Calibration, dict[str, Any]]:
+        width, height = pictures.size
+        return from_numbers([width, width, width / 2, height / 2]), {}
 
-def plausible(size: tuple[int, int]) -> list[float]:
-    """Return intrinsics that a camera of this size may have."""
-    width, height = size
-    return [width, width, width / 2, height / 2]
+    return len(build(config, "dataset", intrinsics=any_camera))
 
 
 def words_of(config: DictConfig, part: range) -> list[str]:
