@@ -41,7 +41,7 @@ def run(images, folder="", first_node=0):
         ([run(range(6))], run(range(4, 9)), [(4, 0), (5, 1)]),  # no keyframe of the last is needed
         ([run(range(6), first_node=7)], run(range(4, 9), first_node=3), [(4, 0), (5, 1)]),
         ([run(range(6)), run(range(4, 9))], run(range(8, 12)), [(10, 0)]),
-        ([run(range(6)), run(range(4, 9))], run(range(5, 7)), [(5, 0), (7, 0), (8, 1)]),  # three have image 5
+        ([run(range(6)), run(range(4, 9))], run(range(4, 6)), [(4, 0), (5, 1), (6, 0), (7, 1)]),  # all three
         ([run(range(6))], run(range(6, 9)), []),
         ([run(range(6))], run(range(4, 9), "tuesday"), []),
         ([run(range(6))], run(range(5, 6)), []),  # no keyframe says whether it is the same

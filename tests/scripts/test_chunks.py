@@ -8,6 +8,7 @@ import own_process
 import pytest
 from tiny_run import SMOKE, compose
 
+from emgs_jax.config import configure
 from emgs_jax.config.configure import build_dataset
 from emgs_jax.io.files import owned
 from emgs_jax.runs.finished_run import read_run
@@ -56,12 +57,17 @@ def test_chunks_have_the_frames_that_the_keys_of_the_walk_choose(start, stop, st
         (("graph=default", "map=monday"), "map= is of one run"),
         (("graph=default", "view=live"), "view= is of one run"),
         (("graph=default", "polish=default"), "polish= is of one run"),
-        (("graph=default", "dataset=camera"), "a recorded walk"),
     ],
 )
 def test_keys_of_one_run_are_refused(tmp_path, words, message):
     with pytest.raises(ValueError, match=message):
         run_chunks(compose("chunks=2", *words), tmp_path, None)
+
+
+def test_a_camera_cannot_be_cut(tmp_path):
+    config = configure.compose("chunks=2", "dataset=camera", "prior=stream", "graph=default")
+    with pytest.raises(ValueError, match="needs a recorded walk"):
+        run_chunks(config, tmp_path, None)
 
 
 def test_chunks_are_of_the_command_that_joins_them(tmp_path):
@@ -74,7 +80,7 @@ def test_all_chunks_that_are_missing_are_named_if_too_few_are_left(tmp_path, mon
     with pytest.raises(ValueError) as error:
         run_chunks(compose("chunks=2", "overlap=1", "graph=default"), tmp_path, None)
     assert str(error.value).splitlines() == [
-        "chunk 1 (dataset.start=0 dataset.stop=4) is missing: no disk",
+        "chunk 1 (dataset.start=0 dataset.stop=3) is missing: no disk",
         "       chunk 2 (dataset.start=2 dataset.stop=6) is missing: it was ended",
         "       so there is nothing to join",
     ]
