@@ -47,7 +47,7 @@ def join(atlas: Atlas, other: Atlas, shared: Sequence[tuple[int, int]] = ()) -> 
     number = max(both.submaps)
     first, begin = both.graph.first_node, len(both.graph.nodes) - len(other.graph.nodes) + other.graph.first_node
     factors = shared_factors(both.graph, [(first + a, begin + b) for a, b in shared])
-    graph = detect_loops_between(both.graph, number, without={factor.b for factor in factors})
+    graph = detect_loops_between(both.graph, number, {factor.b for factor in factors})
     found = shared_placement(graph, number, factors) if factors else placement(graph, number)
     if isinstance(found, str):
         return found
