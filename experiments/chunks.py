@@ -67,7 +67,7 @@ def run_chunks(
 
     with owned(folder):
         todo = undone()
-        tqdm.write(f"{len(parts)} chunks of about {len(parts[0])} frames, {len(todo)} of them to do")
+        tqdm.write(f"{len(parts)} chunks of up to {max(map(len, parts))} frames, {len(todo)} of them to do")
         reasons = launch(folder / FOLDER, [[*words[row], f"hydra.sweep.subdir={row + 1}"] for row in todo], job)
         reasons, left = dict(zip(todo, reasons, strict=True)), undone()
         problems = [f"{names[row]} is missing: {reasons[row] or 'it was ended'}" for row in left]

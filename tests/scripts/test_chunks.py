@@ -113,7 +113,7 @@ def test_what_is_missing_is_named_and_made_by_the_same_command_again_and_the_res
 
     done = own_process.run("experiments.run", *words, timeout=600)
     assert done.returncode == 0, done.stderr
-    assert "3 chunks of about 11 frames, 1 of them to do" in done.stderr + done.stdout
+    assert "3 chunks of up to 11 frames, 1 of them to do" in done.stderr + done.stdout
     assert {name: time for name, time in times_of(folder).items() if name in first} == first
     check_joined(folder, [*range(24)])
     assert (folder / "previous-1" / "metrics.json").exists() and (folder / "report.html").exists()
