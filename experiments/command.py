@@ -45,22 +45,7 @@ def command(
     """Make a program of a function of conf/`name`.yaml, composed with the command line after `rewritten`."""
 
     def decorate(task: Callable[[DictConfig], Any]) -> Callable[[], None]:
-        @wraps(task)
-        def job(config: DictConfig) -> Any:
-            if not HydraConfig.get().verbose:
-                for library in TALKATIVE:
-                    logging.getLogger(library).setLevel(logging.WARNING)
-            with kept_words(HydraConfig.get().job_logging), clear_errors(), nothing_left():
-                check_missing(name, config)
-                if name in KEYS:
-                    check_keys(config, KEYS[name])
-                check_out(config)
-                leave_memory_to_torch(config)
-                check_platforms()
-                leave_float32()
-                if "compilation_cache" in config:
-                    use_compilation_cache(config.compilation_cache)
-                return task(config)
+        job = job_of(name, task)
 
         def main() -> None:
             speak_on()
@@ -77,6 +62,29 @@ def command(
         return main
 
     return decorate
+
+
+def job_of(name: str, task: Callable[[DictConfig], Any]) -> Callable[[DictConfig], Any]:
+    """Make a job for Hydra and its launchers of a function of conf/`name`.yaml."""
+
+    @wraps(task)
+    def job(config: DictConfig) -> Any:
+        if not HydraConfig.get().verbose:
+            for library in TALKATIVE:
+                logging.getLogger(library).setLevel(logging.WARNING)
+        with kept_words(HydraConfig.get().job_logging), clear_errors(), nothing_left():
+            check_missing(name, config)
+            if name in KEYS:
+                check_keys(config, KEYS[name])
+            check_out(config)
+            leave_memory_to_torch(config)
+            check_platforms()
+            leave_float32()
+            if "compilation_cache" in config:
+                use_compilation_cache(config.compilation_cache)
+            return task(config)
+
+    return job
 
 
 def leave_float32() -> None:

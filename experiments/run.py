@@ -54,7 +54,8 @@ from emgs_jax.runs.snapshot import save_snapshot
 from emgs_jax.viewer.live import LiveView, live_view
 from emgs_jax.viewer.ros import NewMapError, RosConfig, RosView, ros_view
 
-from .command import command
+from .chunks import run_chunks
+from .command import command, job_of
 from .interrupt import cameras_first
 from .shorthand import with_source
 
@@ -63,6 +64,8 @@ ALSO_SAID = "segmentation/miou_percent", "trajectory/scale_off_std"  # beside pr
 
 def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     """Map the sequence of `config`, write every output into `folder` and return the metrics."""
+    if config.chunks is not None:
+        raise ValueError("chunks= is for emgs run")
     if config.graph and config.baseline:
         raise ValueError(
             "baseline= fuses every frame where it was placed, and graph= moves poses afterwards: use graph=none with it"
@@ -229,13 +232,19 @@ def _map(
 
 def run_and_print(config: DictConfig) -> float:
     """Run, print the results, and return the trajectory error (inf without one)."""
-    folder = Path(HydraConfig.get().runtime.output_dir)
-    metrics = run(config, folder)
+    folder, problems = Path(HydraConfig.get().runtime.output_dir), []
+    if config.chunks is None:
+        metrics = run(config, folder)
+    else:
+        metrics, problems = run_chunks(config, folder, job_of("config", run_and_print))
     print(metrics_table(metrics) if "trajectory/num_frames" in metrics else why_no_errors(metrics))
     for key, value in metrics.items():
         if value is not None and key not in UP_KEYS and (key.startswith("prior/") or key in ALSO_SAID):
             print(f"{key} {value:.4g}")
     print(f"{last_words(metrics)}everything is in {folder}, {REPORT_FILE} shows it")
+    if problems:
+        again = f"the same command with hydra.run.dir={folder} runs these again, and joins them"
+        raise ValueError("\n       ".join([*problems, again]))
     error = metrics.get("trajectory/ate_sim3_m")
     return math.inf if error is None else error
 

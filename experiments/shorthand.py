@@ -12,7 +12,7 @@ from .command import overrides_of, words_of
 
 CAMERA = re.compile(r"camera(:.*)?$|/dev/video\d+$|(rtsp|rtmp|http|https|udp)://")
 FPS = 3  # images a second of a camera, of which a structure is made
-NUM_FRAMES = 150  # about as many frames of a video are taken, evenly
+NUM_FRAMES = 150  # about as many frames of a video are taken, evenly, by each run
 SECONDS = 5.0  # for an image, from COLMAP to the report, on one core
 
 
@@ -81,7 +81,9 @@ def implied(path: Path, given: dict[str, str]) -> list[str]:
         found["prior"] = "multiview_stereo"
         if "baseline" not in given:  # a baseline fuses frames before the back end moves them
             found["graph"] = "up_to_scale"
-        stride = round(len(chosen(path, given)) / NUM_FRAMES)
+        chunks = given.get("chunks", "1")
+        num_frames = NUM_FRAMES * (int(chunks) if chunks.isdecimal() else 1)  # more than one run maps
+        stride = round(len(chosen(path, given)) / num_frames)
         if is_video(path) and stride > 1 and given.get("prior/dense") != "files":  # files may be of every frame
             found["dataset.stride"] = str(stride)
     return [f"{key}={value}" for key, value in found.items() if key not in given]

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.geometry import scale_pose
+from emgs_jax.loop_closure.place_recognition import Keyframe
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.ops.ranges import number
 from emgs_jax.pose_graph.factors import Factors
@@ -81,7 +82,11 @@ class Factor(NamedTuple):
 def _weights(frame: FrameData, noise: NoiseConfig, angle: float, log_scale: float = np.inf) -> np.ndarray:
     """Compute the root (7, 7) of the information of independent errors, in multiples of ν; infinite ones get 0."""
     depth_noise = noise.depth if frame.depth_noise is None else max(frame.depth_noise, LEAST_NOISE)
-    return np.diag(1.0 / (depth_noise * np.array([angle * frame.depth] * 3 + [angle] * 3 + [log_scale])))
+    return _root(depth_noise, frame.depth, angle, log_scale)
+
+
+def _root(depth_noise: float, depth: float, angle: float, log_scale: float) -> np.ndarray:
+    return np.diag(1.0 / (depth_noise * np.array([angle * depth] * 3 + [angle] * 3 + [log_scale])))
 
 
 def sequential_factor(
@@ -166,6 +171,23 @@ def map_factor(
     """Build the map factor: the last frame's pose relative to frame `origin`, whose Gaussians it was registered to."""
     measured = _relative_pose(poses, log_scales, -1, origin)
     return Factor(len(poses) - 1, origin, measured, 0.0, _weights(frame, noise, noise.map), is_loop=False)
+
+
+def shared_factor(a: Keyframe, b: Keyframe, depth_noise: float | None, noise: NoiseConfig) -> Factor | None:
+    """Build the factor of an image that is a node of two maps: one pose, and units in the ratio of the depths.
+
+    It holds both nodes together as firmly as consecutive frames of one map; None if no pixel has a depth in both.
+
+    Args:
+        depth_noise: ν of b, in its own map; None if it was not registered.
+    """
+    is_known = (a.depths > 0) & (b.depths > 0)
+    if not is_known.any():
+        return None
+    ratio = float(np.median(np.log(a.depths[is_known] / b.depths[is_known])))
+    nu = noise.depth if depth_noise is None else max(depth_noise, LEAST_NOISE)
+    weights = _root(nu, float(np.median(a.depths[is_known])), noise.pair, noise.log_scale)
+    return Factor(a.frame, b.frame, np.eye(4), ratio, weights, is_loop=False)
 
 
 def measured_again(factor: Factor, poses: Sequence[np.ndarray], log_scales: Sequence[float]) -> Factor:

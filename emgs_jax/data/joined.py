@@ -14,15 +14,21 @@ from emgs_jax.data.reading import Intrinsics, Size, check_index
 
 
 class JoinedFrames(Dataset):
-    """One data set after the other; without `has_truth` true poses, which are in several worlds, are left out."""
+    """One data set after the other; without `has_truth` true poses, which are in several worlds, are left out.
 
-    def __init__(self, parts: Sequence[Dataset], has_truth: bool = True) -> None:
+    Args:
+        repeated: rows that are left out, because another one is the same image.
+    """
+
+    def __init__(self, parts: Sequence[Dataset], has_truth: bool = True, repeated: Sequence[int] = ()) -> None:
         self.name, self.sequence = (joined_name(getattr(one, key) for one in parts) for key in ("name", "sequence"))
         self.size, self.intrinsics = common_camera([(one.size, one.intrinsics) for one in parts])
         self.classes = parts[0].classes if len({tuple(one.classes) for one in parts}) == 1 else ()
         self.has_ground_truth = has_truth and all(one.has_ground_truth for one in parts)
-        self._parts, self._has_truth = parts, has_truth
-        self._rows = [(one, row) for one in parts for row in range(len(one))]
+        self._parts, self._has_truth, self._repeated = parts, has_truth, sorted(repeated)
+        left_out = {*repeated}
+        every = [(one, row) for one in parts for row in range(len(one))]
+        self._rows = [one for row, one in enumerate(every) if row not in left_out]
 
     def __len__(self) -> int:
         return len(self._rows)
@@ -45,7 +51,7 @@ class JoinedFrames(Dataset):
         return part.files(row)
 
     def fingerprint(self) -> str:
-        known = [one.fingerprint() for one in self._parts], self._has_truth
+        known = [one.fingerprint() for one in self._parts], self._has_truth, *filter(None, [self._repeated])
         return hashlib.sha256(repr(known).encode()).hexdigest()
 
 

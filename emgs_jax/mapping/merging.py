@@ -1,7 +1,8 @@
 """Merge two maps: relocalize a finished run in another one by its keyframes, and join it by a similarity.
 
 Loops between both are verified like those of one run, but with a free ratio of units, so that runs of different cameras
-and priors can be joined.
+and priors can be joined. If both runs have some images in common, such as consecutive parts of a walk, the poses of
+these say where the other map is.
 """
 
 from collections import Counter
@@ -11,7 +12,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from emgs_jax.back_end.factors import Factor, shared_factor
 from emgs_jax.back_end.loops import consistent_loops, detect_loops_between
 from emgs_jax.back_end.optimization import close_loops, one_layer_of_state
 from emgs_jax.back_end.saved_map import LEFT_OUT
@@ -26,10 +29,13 @@ from emgs_jax.mapping.capacity import add_map
 MEASURED = "factors", "verified", "violating", "accepted", "refusals"  # fields that connect two nodes each
 
 
-def join(atlas: Atlas, other: Atlas) -> Atlas | str:
+def join(atlas: Atlas, other: Atlas, shared: Sequence[tuple[int, int]] = ()) -> Atlas | str:
     """Join the active submap of another atlas with that of `atlas`, whose world and unit stay.
 
     The other's nodes come after those of `atlas`; nodes of saved maps come before both.
+
+    Args:
+        shared: a node of `atlas` and one of the other that are of one image, both counted from `first_node`.
 
     Returns:
         The atlas of both, or why they cannot be joined.
@@ -39,17 +45,20 @@ def join(atlas: Atlas, other: Atlas) -> Atlas | str:
         return f"its features have width {widths[1]}, those of the first run {widths[0]}: map both with one prior"
     both = beside(atlas, other)
     number = max(both.submaps)
-    graph = detect_loops_between(both.graph, number)
-    found = placement(graph, number)
+    first, begin = both.graph.first_node, len(both.graph.nodes) - len(other.graph.nodes) + other.graph.first_node
+    factors = shared_factors(both.graph, [(first + a, begin + b) for a, b in shared])
+    graph = detect_loops_between(both.graph, number, {factor.b for factor in factors})
+    found = shared_placement(graph, number, factors) if factors else placement(graph, number)
     if isinstance(found, str):
         return found
     similarity, loops = found
-    graph = place_submap(graph, number, similarity)
+    graph = place_submap(replace(graph, factors=[*graph.factors, *factors]), number, similarity)
     map = transformed(both.submaps[number].state.map, **vars(similarity))
     map, config = add_map(both.state.map, map, both.config)
     graph, state = close_loops(graph, replace(both.state, map=map), loops)
     if graph.closures[-1].info.reason:
-        return f"no poses fit the {len(loops)} loops between both: {graph.closures[-1].info.reason}"
+        between = f"{len(loops)} loops and {len(factors)} images" if factors else f"{len(loops)} loops"
+        return f"no poses fit the {between} between both: {graph.closures[-1].info.reason}"
     is_other = [node.submap == number for node in both.graph.nodes]
     state = one_layer_of_state(state, graph, is_other, config.existence)
     submaps = {one: submap for one, submap in both.submaps.items() if one != number}
@@ -90,6 +99,26 @@ def with_lost(atlas: Atlas, lost: Sequence[Node]) -> Atlas:
     return replace(atlas, graph=replace(atlas.graph, nodes=(*nodes[:first], *lost, *nodes[first:])))
 
 
+def without_repeats(atlas: Atlas, kept: Sequence[int]) -> Atlas:
+    """Leave out nodes that are of the image of another one, which stands for them wherever they are named.
+
+    Args:
+        kept: the node that stands for each one, itself if it stays; both counted from `first_node`.
+    """
+    first = atlas.graph.first_node
+    stays = [True] * first + [row == one for row, one in enumerate(kept)]
+    place = np.cumsum(stays) - 1
+    found = renumbered(atlas, [int(place[row]) for row in [*range(first), *(first + one for one in kept)]], sum(stays))
+    old, database = atlas.graph.database.keyframes, found.graph.database
+    rows = [row for row, one in enumerate(old) if stays[one.frame]]
+    database = replace(
+        database, keyframes=tuple(database.keyframes[row] for row in rows), vectors=database.vectors[rows]
+    )
+    nodes = tuple(node for node, ok in zip(found.graph.nodes, stays, strict=True) if ok)
+    between = {name: [one for one in getattr(found.graph, name) if one.a != one.b] for name in MEASURED}
+    return replace(found, graph=replace(found.graph, nodes=nodes, database=database, **between))
+
+
 def renumbered(atlas: Atlas, rows: Sequence[int], count: int) -> Atlas:
     """Renumber the nodes, among `count`, wherever they are named; nothing else changes."""
     graph, new_births = atlas.graph, jnp.asarray(rows, jnp.int32)
@@ -128,11 +157,8 @@ def placement(graph: BackEnd, number: int) -> tuple[Sim3, list[LoopMeasurement]]
         return f"no keyframe shows the same place ({', '.join(f'{gate} {count}' for gate, count in gates) or 'none'})"
     of_query = {loop.b: loop for loop in sorted(between, key=lambda loop: loop.num_inliers)}
     most = graph.config.relocalization.num_candidates
-    tried: list[tuple[Sim3, list[LoopMeasurement]]] = []
-    for loop in sorted(of_query.values(), key=lambda loop: -loop.num_inliers)[:most]:
-        similarity = implied(graph, loop)
-        good = {(one.a, one.b) for one in consistent_loops(place_submap(graph, number, similarity))}
-        tried.append((similarity, [one for one in between if (one.a, one.b) in good]))
+    best = sorted(of_query.values(), key=lambda loop: -loop.num_inliers)[:most]
+    tried = [consistent_at(graph, number, implied(graph, loop)) for loop in best]
     similarity, loops = max(tried, key=lambda one: len(one[1]))
     if loops:
         return similarity, loops
@@ -143,7 +169,37 @@ def placement(graph: BackEnd, number: int) -> tuple[Sim3, list[LoopMeasurement]]
     )
 
 
-def implied(graph: BackEnd, loop: LoopMeasurement) -> Sim3:
+def consistent_at(graph: BackEnd, number: int, similarity: Sim3) -> tuple[Sim3, list[LoopMeasurement]]:
+    """Select the loops to a submap that are spatially consistent where the similarity, also returned, places it."""
+    good = {(one.a, one.b) for one in consistent_loops(place_submap(graph, number, similarity))}
+    between = (loop for loop in graph.verified if graph.nodes[loop.b].submap == number)
+    return similarity, [loop for loop in between if (loop.a, loop.b) in good]
+
+
+def shared_factors(graph: BackEnd, pairs: Sequence[tuple[int, int]]) -> list[Factor]:
+    """Build the factors of pairs of nodes that are of one image: of those that are keyframes in both maps."""
+    known = {one.frame: one for one in graph.database.keyframes if graph.nodes[one.frame].is_placed}
+    keyframes = [(known[a], known[b]) for a, b in pairs if a in known and b in known]
+    noise = [graph.nodes[one.frame].depth_noise for _, one in keyframes]
+    found = (shared_factor(*pair, nu, graph.config.noise) for pair, nu in zip(keyframes, noise, strict=True))
+    return [factor for factor in found if factor is not None]
+
+
+def shared_placement(graph: BackEnd, number: int, factors: Sequence[Factor]) -> tuple[Sim3, list[LoopMeasurement]]:
+    """Find the similarity from a submap to the active one by the poses of the images that both have.
+
+    Returns:
+        The mean of what these imply, and the other loops that are spatially consistent there.
+    """
+    found = [implied(graph, factor) for factor in factors]
+    scale = float(np.exp(np.median([np.log(one.scale) for one in found])))
+    rotation = Rotation.from_matrix([one.rotation for one in found]).mean().as_matrix()
+    ends = [(graph.nodes[factor.a].pose[:3, 3], graph.nodes[factor.b].pose[:3, 3]) for factor in factors]
+    translation = np.mean([here - scale * rotation @ there for here, there in ends], axis=0)
+    return consistent_at(graph, number, Sim3(scale, rotation, translation))
+
+
+def implied(graph: BackEnd, loop: LoopMeasurement | Factor) -> Sim3:
     """Compute the similarity that moves a loop's query, with its unit, to where the candidate sees it."""
     here, there = graph.nodes[loop.a], graph.nodes[loop.b]
     seen = here.pose @ scale_pose(loop.Z_a_b, float(np.exp(here.log_scale)))

@@ -36,11 +36,14 @@ def images_of(run: FinishedRun) -> tuple[ReadableFrames | None, str]:
 
 
 class ImagesOfRuns(JoinedFrames):
-    """The images of the runs in some folders, one run after the other; ValueError if those of a run are gone."""
+    """The images of the runs in some folders, one run after the other; ValueError if those of a run are gone.
 
-    def __init__(self, runs: Sequence[str], has_truth: bool = True) -> None:
+    Those in the `repeated` rows are left out.
+    """
+
+    def __init__(self, runs: Sequence[str], has_truth: bool = True, repeated: Sequence[int] = ()) -> None:
         found = [images_of(read_run(Path(folder))) for folder in runs]
         for folder, (dataset, note) in zip(runs, found, strict=True):
             if dataset is None:
                 raise ValueError(f"{folder}: {note}")
-        super().__init__([dataset for dataset, _ in found], has_truth)
+        super().__init__([dataset for dataset, _ in found], has_truth, repeated)

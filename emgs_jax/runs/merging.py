@@ -15,13 +15,13 @@ from emgs_jax.config.configure import CONF, build, build_dataset, compose, graph
 from emgs_jax.data.joined import common_camera, joined_name
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
-from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.features.text import save_text
 from emgs_jax.io.files import FrameLog, new_folder
 from emgs_jax.io.trajectory import from_tum
+from emgs_jax.loop_closure.place_recognition import Keyframe
 from emgs_jax.mapping.atlas import Atlas, set_unjoined_apart, unvisited
 from emgs_jax.mapping.integrate import finish_back_end
-from emgs_jax.mapping.merging import beside, join, motion, with_lost
+from emgs_jax.mapping.merging import beside, join, motion, with_lost, without_repeats
 from emgs_jax.mapping.records import FrameRecord, to_line, with_moved_nodes, with_unjoined_apart
 from emgs_jax.mapping.run import MappingRun, with_truth
 from emgs_jax.ops.camera import Camera
@@ -117,25 +117,45 @@ def check_features(first: FinishedRun, other: FinishedRun) -> None:
         )
 
 
-def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, list[int], dict[int, str]]:
-    """Join all runs with the first one, each by common places with a run that is already joined.
+@dataclass(frozen=True)
+class Merged:
+    """Runs that are joined.
 
-    Returns the run of all, the order of their frames in it, and why a run was not joined. Without `has_truth` the true
-    poses are not in one world, and are left out. ValueError if none can be joined with the first,
-    or if features mean something else.
+    Args:
+        run: with all frames of all runs, one run after the other.
+        order: of the runs; those that are joined come first.
+        reasons: why a run is not joined.
+        kept: the row in `run.records` that stands for each one: its own, or that of the same image in another run.
+    """
+
+    run: MappingRun
+    order: list[int]
+    reasons: dict[int, str]
+    kept: list[int]
+
+
+def merged(runs: Sequence[MergeableRun], has_truth: bool) -> Merged:
+    """Join all runs with the first one, each by common images or places with a run that is already joined.
+
+    Without `has_truth` the true poses are not in one world, and are left out. ValueError if none can be joined with the
+    first, or if features mean something else.
     """
     for other in runs[1:]:
         check_features(runs[0].finished, other.finished)
     atlas, order, pending, reasons = runs[0].atlas, [0], [*range(1, len(runs))], {}
+    images = [*range(len(runs[0].records))]  # the first row of the image of each
     while pending:
         for number in pending:
-            found = join(atlas, runs[number].atlas)
+            shared = shared_frames([runs[one] for one in order], runs[number])
+            found = join(atlas, runs[number].atlas, shared)
             if isinstance(found, Atlas):
                 break
             reasons[number] = found
         else:
             break
-        atlas, order = found, [*order, number]
+        atlas, order, known = found, [*order, number], {row: images[one] for one, row in reversed(shared)}
+        begin = len(images)
+        images += [known.get(row, begin + row) for row in range(len(runs[number].records))]
         pending.remove(number)
         reasons.pop(number, None)
     if len(order) == 1:
@@ -143,13 +163,65 @@ def merged(runs: Sequence[MergeableRun], has_truth: bool) -> tuple[MappingRun, l
         raise ValueError(f"none can be joined with {runs[0].finished.folder}, so there is no merged run: {why}")
     for number in pending:
         atlas, order = beside(atlas, runs[number].atlas), [*order, number]
+        images += range(len(images), len(images) + len(runs[number].records))
     atlas = set_unjoined_apart(atlas, kept=0)
     records = enumerate(record for number in order for record in runs[number].records)
     records = [replace(one, index=row, true_pose=one.true_pose if has_truth else None) for row, one in records]
     records = with_unjoined_apart(records, atlas.graph.nodes, kept=0)
     atlas = numbered(finish_back_end(atlas))
     records = with_moved_nodes(records, (), atlas.graph.nodes)
-    return MappingRun(atlas, records=in_one_world(records, [runs[number] for number in order], atlas)), order, reasons
+    records = in_one_world(records, [runs[number] for number in order], atlas)
+    is_placed = [node.is_placed for node in atlas.graph.nodes[atlas.graph.first_node :]]
+    return Merged(MappingRun(atlas, records=records), order, reasons, first_placed(images, is_placed))
+
+
+def shared_frames(parts: Sequence[MergeableRun], other: MergeableRun) -> list[tuple[int, int]]:
+    """Pair the frames of runs, counted one run after the other, with those of another run that are the same image.
+
+    Frames are the same if they have one name and time, and those that are keyframes in both have the same keypoints.
+    """
+    pairs, begin, keyframes = [], 0, keyframes_of(other)
+    rows = {(record.name, record.timestamp): row for row, record in enumerate(other.records)}
+    for part in parts:
+        names = ((record.name, record.timestamp) for record in part.records)
+        found = [(row, rows[name]) for row, name in enumerate(names) if name in rows]
+        known = keyframes_of(part)
+        same = [is_same_image(known[a], keyframes[b]) for a, b in found if a in known and b in keyframes]
+        pairs += [(begin + a, b) for a, b in found] if same and all(same) else []
+        begin += len(part.records)
+    return pairs
+
+
+def keyframes_of(run: MergeableRun) -> dict[int, Keyframe]:
+    """Return the keyframes of a run's own frames by row."""
+    graph = run.atlas.graph
+    return {one.frame - graph.first_node: one for one in graph.database.keyframes if one.frame >= graph.first_node}
+
+
+def is_same_image(a: Keyframe, b: Keyframe) -> bool:
+    """Test whether two keyframes are of one image: it has the same keypoints, but for rounding."""
+    return a.size == b.size and a.pixels.shape == b.pixels.shape and np.allclose(a.pixels, b.pixels, atol=0.1)
+
+
+def first_placed(images: Sequence[int], is_placed: Sequence[bool]) -> list[int]:
+    """For each row, find the first one of its image that is placed, or the first if none is."""
+    found: dict[int, int] = {}
+    for row, image in enumerate(images):
+        if image not in found or (is_placed[row] and not is_placed[found[image]]):
+            found[image] = row
+    return [found[image] for image in images]
+
+
+def each_once(run: MappingRun, kept: Sequence[int]) -> MappingRun:
+    """Leave out the frames for which another one stands, see `Merged`."""
+    atlas = numbered(without_repeats(run.atlas, kept))
+    rows = [row for row, one in enumerate(kept) if row == one]
+    nodes = atlas.graph.nodes[atlas.graph.first_node :]
+    records = [
+        replace(run.records[row], index=new, origin=node.origin)
+        for new, (row, node) in enumerate(zip(rows, nodes, strict=True))
+    ]
+    return replace(run, atlas=atlas, records=records)
 
 
 def in_one_world(records: Sequence[FrameRecord], parts: Sequence[MergeableRun], atlas: Atlas) -> list[FrameRecord]:
@@ -184,45 +256,55 @@ def merge(folders: Sequence[Path], out: Path, has_truth: bool = True) -> tuple[d
     Returns its metrics, and notes: which run was not joined and why, and what could not be made.
     """
     read = [mergeable(folder) for folder in folders]
-    run, order, reasons = merged(read, has_truth)
+    found = merged(read, has_truth)
+    with new_folder(out) as new:
+        return save_merged(new, read, found, has_truth)
+
+
+def save_merged(
+    folder: Path, read: Sequence[MergeableRun], found: Merged, has_truth: bool
+) -> tuple[dict[str, Any], list[str]]:
+    """Write the files of a merged run; return what `merge` does."""
+    order, reasons, run = found.order, found.reasons, each_once(found.run, found.kept)
     parts = [read[number].finished for number in order]
     joined = [read[number] for number in order if number not in reasons]
     keeps_points = all(_has_own_points(one.finished) for one in joined)
-    origin, dataset, note = _origin(parts, has_truth, "own" if keeps_points else "map")
+    repeated = [row for row, one in enumerate(found.kept) if row != one]
+    origin, dataset, note = _origin(parts, (has_truth, repeated), "own" if keeps_points else "map")
     config = config_of(parts[0])
     densify, evaluation = replace(build(config, "densify"), points="map"), build(config, "evaluation")
     (width, height), (fx, fy, cx, cy) = origin["data"]["frames"].values()
     run = replace(run, atlas=replace(run.atlas, camera=Camera((fx, fy), (cx, cy), width, height)))
-    with new_folder(out) as new:
-        with FrameLog(new / FRAMES_FILE) as log:
-            for record in run.records:
-                log.append(to_line(record))
-        save_progress(new, run)
-        dense = DenseMap(center_cloud(run)) if dataset is None else dense_map(run, dataset, densify, evaluation)
-        if keeps_points:
-            dense = replace(dense, cloud=kept_cloud(joined, run, evaluation))
-        metrics = {}
-        if dataset is not None:
-            scorer = Scorer(dataset, evaluation, true_cloud(dataset, evaluation), None, None)
-            metrics = score_map(run, dense.cloud, center_cloud(run), None, scorer) | dense.rendering
-        title, unit = f"{len(order) - len(reasons)} runs merged", "m" if parts[0].is_metric else "units"
-        notes = save_outputs(new, run, dense, densify, title, evaluation.alignment == "sim3", unit)
-        if parts[0].text is not None:
-            save_text(new / TEXT_FILE, parts[0].text)
-        metrics |= describe(run) | score_back_end(run) | {"provenance": origin}
-        write_metrics(new / METRICS_FILE, metrics)
+    with FrameLog(folder / FRAMES_FILE) as log:
+        for record in run.records:
+            log.append(to_line(record))
+    save_progress(folder, run)
+    dense = DenseMap(center_cloud(run)) if dataset is None else dense_map(run, dataset, densify, evaluation)
+    if keeps_points:
+        voxel = voxel_of(with_truth(run, run.poses), evaluation)
+        dense = replace(dense, cloud=kept_cloud(joined, found.run.atlas.graph.nodes, voxel))
+    metrics = {}
+    if dataset is not None:
+        scorer = Scorer(dataset, evaluation, true_cloud(dataset, evaluation), None, None)
+        metrics = score_map(run, dense.cloud, center_cloud(run), None, scorer) | dense.rendering
+    title, unit = f"{len(order) - len(reasons)} runs merged", "m" if parts[0].is_metric else "units"
+    notes = save_outputs(folder, run, dense, densify, title, evaluation.alignment == "sim3", unit)
+    if parts[0].text is not None:
+        save_text(folder / TEXT_FILE, parts[0].text)
+    metrics |= describe(run) | score_back_end(run) | {"provenance": origin}
+    write_metrics(folder / METRICS_FILE, metrics)
     apart = [f"{read[n].finished.folder} is not joined, and in submaps/ as it is: {why}" for n, why in reasons.items()]
     return metrics, [*apart, *notes, *filter(None, [note])]
 
 
-def kept_cloud(parts: Sequence[MergeableRun], run: MappingRun, evaluation: EvaluationConfig) -> PointCloud:
-    """Average the points of all joined runs, moved into their common map, in voxels."""
-    moved = moved_parts([part.atlas for part in parts], run.atlas.graph.nodes)
+def kept_cloud(parts: Sequence[MergeableRun], nodes: Sequence[Node], voxel: float) -> PointCloud:
+    """Average the points of all joined runs, moved with their nodes into their common map, in voxels."""
+    moved = moved_parts([part.atlas for part in parts], nodes)
     clouds = (
         moved_points(read_points(part.finished.folder / POINTS_FILE), one, part.atlas.graph.config.deform)
         for part, one in zip(parts, moved, strict=True)
     )
-    return fuse_clouds(clouds, voxel_of(with_truth(run, run.poses), evaluation))
+    return fuse_clouds(clouds, voxel)
 
 
 def _has_own_points(run: FinishedRun) -> bool:
@@ -230,13 +312,17 @@ def _has_own_points(run: FinishedRun) -> bool:
 
 
 def _origin(
-    parts: Sequence[FinishedRun], has_truth: bool, points: str
+    parts: Sequence[FinishedRun], shown: tuple[bool, Sequence[int]], points: str
 ) -> tuple[dict[str, Any], ReadableFrames | None, str]:
-    """Make the provenance of a merged run with such `points`, its images, and the reason if there are none."""
+    """Make the provenance of a merged run with such `points`, its images, and the reason if there are none.
+
+    Args:
+        shown: has_truth and the repeated rows of `ImagesOfRuns`.
+    """
     first = parts[0].provenance
     settings = OmegaConf.to_container(OmegaConf.create(dict(first["config"])), resolve=True)
-    images = {"_target_": OmegaConf.load(CONF / "merge.yaml").dataset["_target_"], "has_truth": has_truth}
-    images |= {"runs": [str(one.folder.resolve()) for one in parts]}
+    images = {"_target_": OmegaConf.load(CONF / "merge.yaml").dataset["_target_"], "has_truth": shown[0]}
+    images |= {"runs": [str(one.folder.resolve()) for one in parts], "repeated": [*shown[1]]}
     settings |= {"dataset": images, "map": None, "on_bad_frame": "error"}
     settings["densify"] |= {"points": points}
     if "masks" in settings:

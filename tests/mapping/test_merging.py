@@ -123,6 +123,21 @@ def test_two_walks_past_the_same_things_become_one_map_along_the_true_path():
     assert alone < both < 1.7 * alone, "one layer, where both saw it"
 
 
+def test_images_that_both_maps_have_join_them_where_no_place_is_recognized():
+    """No image has a keypoint; the other prior has another unit."""
+    words = ("graph.place_recognition.min_contrast=1",)
+    one, frames = atlas(tuple(range(0, 16, 2)), *words), walk(range(10, 26, 2), *words)
+    other = mapped(frames, Scaled(prior_of(frames, *words)), words=words).atlas
+    assert "no keyframe shows the same place" in join(one, other)
+    found = join(one, other, [(5, 0), (6, 1), (7, 2)])
+    assert isinstance(found, Atlas), found
+    truth = np.stack([frame.T_world_camera for part in (walk(range(0, 16, 2)), frames) for frame in part])
+    poses = np.stack([node.pose for node in found.graph.nodes])
+    assert pose_difference(poses, poses[0] @ np.linalg.inv(truth[0]) @ truth)[0].max() < 0.02
+    scales = np.array([node.log_scale for node in found.graph.nodes])
+    np.testing.assert_allclose(scales[8:] - scales[:8].mean(), -np.log(UNIT), atol=0.02)
+
+
 TWINS = ("dataset=apartment", "dataset.walk=twin_rooms", "dataset.num_frames=null", "dataset.stop=null")
 
 

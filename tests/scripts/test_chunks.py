@@ -1,0 +1,136 @@
+"""A walk in chunks: how it is cut, what is done again, and the joined run; oracles: the whole walk, its true path."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import own_process
+import pytest
+from tiny_run import SMOKE, compose
+
+from emgs_jax.config import configure
+from emgs_jax.config.configure import build_dataset
+from emgs_jax.io.files import owned
+from emgs_jax.runs.finished_run import read_run
+from emgs_jax.runs.images import images_of
+from experiments import chunks
+from experiments.chunks import cut, num_frames, run_chunks, words_of
+from experiments.run import run
+
+
+@pytest.mark.parametrize("num", [2, 3, 4, 7, 12])
+@pytest.mark.parametrize("overlap", [1, 2, 5, 20])
+def test_every_frame_is_in_one_chunk_or_shared_by_two_neighbours(num, overlap):
+    least = (num + 1) * overlap
+    for count in range(least, least + 60):
+        parts = cut(count, num, overlap)
+        times = np.bincount(np.concatenate(parts), minlength=count)
+        assert len(times) == count and set(times) <= {1, 2} and len(parts) == num
+        assert all(len(set(one) & set(other)) == overlap for one, other in zip(parts, parts[1:], strict=False))
+        assert np.ptp([len(part) for part in parts]) <= 1, "the last is no rest"
+    with pytest.raises(ValueError, match=f"chunks={num} overlap={overlap} would leave"):
+        cut(least - 1, num, overlap)
+
+
+@pytest.mark.parametrize(("num", "overlap"), [(1, 5), (2, 0), (2.5, 5), ("four", 5), (-2, 5)])
+def test_what_is_no_number_of_chunks_is_refused(num, overlap):
+    with pytest.raises(ValueError, match="chunks must be 2 or more and overlap 1 or more"):
+        cut(100, num, overlap)
+
+
+@pytest.mark.parametrize(("start", "stop", "stride"), [(0, 40, 1), (3, 37, 2), (1, 40, 3)])
+def test_chunks_have_the_frames_that_the_keys_of_the_walk_choose(start, stop, stride):
+    words = [f"dataset.start={start}", f"dataset.stop={stop}", f"dataset.stride={stride}"]
+    config = compose(*words, "graph=default")
+    whole = [frame.name for frame in build_dataset(config)]
+    assert num_frames(config) == len(whole)
+    for part in cut(len(whole), 3, 2):
+        own = words_of(config, part)
+        assert own[0] == "chunks=null"
+        assert [frame.name for frame in build_dataset(compose(*words, *own[1:]))] == [whole[row] for row in part]
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        ((), "add graph=default"),
+        (("graph=default", "map=monday"), "map= is of one run"),
+        (("graph=default", "view=live"), "view= is of one run"),
+        (("graph=default", "polish=default"), "polish= is of one run"),
+    ],
+)
+def test_keys_of_one_run_are_refused(tmp_path, words, message):
+    with pytest.raises(ValueError, match=message):
+        run_chunks(compose("chunks=2", *words), tmp_path, None)
+
+
+def test_a_camera_cannot_be_cut(tmp_path):
+    config = configure.compose("chunks=2", "dataset=camera", "prior=stream", "graph=default")
+    with pytest.raises(ValueError, match="needs a recorded walk"):
+        run_chunks(config, tmp_path, None)
+
+
+def test_chunks_are_of_the_command_that_joins_them(tmp_path):
+    with pytest.raises(ValueError, match="is for emgs run"):
+        run(compose("chunks=2"), tmp_path)
+
+
+def test_all_chunks_that_are_missing_are_named_if_too_few_are_left(tmp_path, monkeypatch):
+    monkeypatch.setattr(chunks, "launch", lambda folder, words, job: ["no disk", ""][: len(words)])
+    with pytest.raises(ValueError) as error:
+        run_chunks(compose("chunks=2", "overlap=1", "graph=default"), tmp_path, None)
+    assert str(error.value).splitlines() == [
+        "chunk 1 (dataset.start=0 dataset.stop=3) is missing: no disk",
+        "       chunk 2 (dataset.start=2 dataset.stop=6) is missing: it was ended",
+        "       so there is nothing to join",
+    ]
+
+
+WALK = (*SMOKE, "dataset.num_frames=80", "dataset.stop=24", "prior.level=0", "graph=default")
+CHUNKS = ("chunks=3", "overlap=4")  # frames 0 to 10, 7 to 17, 13 to 23
+
+
+def times_of(folder: Path) -> dict[str, int]:
+    return {path.parent.name: path.stat().st_mtime_ns for path in folder.glob("chunks/*/metrics.json")}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("launcher", ["basic", pytest.param("joblib", marks=pytest.mark.weekly)])
+def test_what_is_missing_is_named_and_made_by_the_same_command_again_and_the_rest_is_joined(tmp_path, launcher):
+    """The last chunk cannot be written at first. The prior is exact, so the joined path is the true one."""
+    if launcher != "basic":
+        pytest.importorskip(f"hydra_plugins.hydra_{launcher}_launcher")
+    folder = tmp_path / "walk"
+    words = (*WALK, *CHUNKS, f"hydra/launcher={launcher}", f"hydra.run.dir={folder}")
+    with owned(folder / "chunks" / "3"):
+        done = own_process.run("experiments.run", *words, timeout=600)
+    assert done.returncode == 1, done.stderr
+    assert "error: chunk 3 (dataset.start=13 dataset.stop=24) is missing: another program is writing" in done.stderr
+    assert f"the same command with hydra.run.dir={folder}" in done.stderr
+    first = times_of(folder)
+    assert first.keys() == {"1", "2"}
+    check_joined(folder, [*range(17)])
+
+    done = own_process.run("experiments.run", *words, timeout=600)
+    assert done.returncode == 0, done.stderr
+    assert "3 chunks of up to 11 frames, 1 of them to do" in done.stderr + done.stdout
+    assert {name: time for name, time in times_of(folder).items() if name in first} == first
+    check_joined(folder, [*range(24)])
+    assert (folder / "previous-1" / "metrics.json").exists() and (folder / "report.html").exists()
+
+
+def check_joined(folder: Path, frames: list[int]) -> None:
+    """Each frame is once in the path, which is the true one, and the images are found again."""
+    joined = read_run(folder)
+    assert [int(line["timestamp"]) for line in joined.frames] == frames
+    assert [line["index"] for line in joined.frames] == [*range(len(frames))]
+    assert joined.is_placed.all() and len((folder / "trajectory.txt").read_text().splitlines()) >= len(frames)
+    here = np.linalg.inv(joined.poses[0]) @ joined.poses
+    true = np.linalg.inv(joined.truth[0]) @ joined.truth
+    np.testing.assert_allclose(here, true, atol=0.005)
+    images, note = images_of(joined)
+    assert not note and [frame.timestamp for frame in images] == [float(row) for row in frames]
+    metrics, alone = (json.loads((path / "metrics.json").read_text()) for path in (folder, folder / "chunks" / "1"))
+    assert metrics["map/double_wall_percent"] < alone["map/double_wall_percent"] + 2
+    births = np.asarray(joined.map.birth)[np.asarray(joined.map.gaussians.valid)]
+    assert births.min() >= 0 and frames[-1] >= births.max() > 10
