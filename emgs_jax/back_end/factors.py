@@ -68,7 +68,11 @@ class FrameData:
 
 
 class Factor(NamedTuple):
-    """One row of `Factors`, on the host: Z (4, 4), sqrt_info (7, 7)."""
+    """One row of `Factors`, on the host: Z (4, 4), sqrt_info (7, 7).
+
+    Args:
+        is_predicted: Z is the prior's own prediction, not the difference of two estimated poses.
+    """
 
     a: int
     b: int
@@ -76,6 +80,7 @@ class Factor(NamedTuple):
     log_ratio: float
     sqrt_info: np.ndarray
     is_loop: bool
+    is_predicted: bool = False
 
 
 def _weights(frame: FrameData, noise: NoiseConfig, angle: float, log_scale: float = np.inf) -> np.ndarray:
@@ -139,7 +144,7 @@ def window_factor(
         return None
     measured = np.linalg.inv(frame.T_anchor_views[frame.index]) @ frame.T_anchor_views[frame.index - offset]
     weights = _weights(frame, noise, np.sqrt(offset) * noise.pair)
-    factor = Factor(time, time - offset, measured, 0.0, weights, is_loop=False)
+    factor = Factor(time, time - offset, measured, 0.0, weights, is_loop=False, is_predicted=True)
     return factor if chi2(factor, poses, log_scales) <= max_chi2 else None
 
 
@@ -168,9 +173,25 @@ def map_factor(
     return Factor(len(poses) - 1, origin, measured, 0.0, _weights(frame, noise, noise.map), is_loop=False)
 
 
-def measured_again(factor: Factor, poses: Sequence[np.ndarray], log_scales: Sequence[float]) -> Factor:
-    """Return a factor, other than of a loop, with the relative pose that two nodes have now."""
-    return factor if factor.is_loop else factor._replace(Z_a_b=_relative_pose(poses, log_scales, factor.a, factor.b))
+def measured_again(
+    factor: Factor,
+    poses: Sequence[np.ndarray],
+    log_scales: Sequence[float],
+    predicted: Sequence[np.ndarray | None],
+) -> Factor:
+    """Return a factor with what its measurement is now: a loop's stays, a window factor's is the prior's prediction.
+
+    Any other has the relative pose of its nodes.
+
+    Args:
+        predicted: T_anchor_camera (4, 4) of all nodes, as the prior predicts them now; None without one.
+    """
+    a, b = predicted[factor.a], predicted[factor.b]
+    if factor.is_loop or (factor.is_predicted and (a is None or b is None)):
+        return factor
+    if factor.is_predicted:
+        return factor._replace(Z_a_b=np.linalg.inv(a) @ b)
+    return factor._replace(Z_a_b=_relative_pose(poses, log_scales, factor.a, factor.b))
 
 
 def _relative_pose(poses: Sequence[np.ndarray], log_scales: Sequence[float], a: int, b: int) -> np.ndarray:
@@ -187,7 +208,7 @@ def stack_factors(factors: Sequence[Factor]) -> Factors:
     """Stack factors as float32 arrays, padded to a power of two so that a growing graph compiles rarely."""
     count = len(factors)
     size = bucket(count)
-    a, b, Z, ratios, weights, is_loop = zip(*factors, *[factors[0]] * (size - count), strict=True)
+    a, b, Z, ratios, weights, is_loop, _ = zip(*factors, *[factors[0]] * (size - count), strict=True)
     return Factors(
         a=jnp.asarray(a, jnp.int32),
         b=jnp.asarray(b, jnp.int32),

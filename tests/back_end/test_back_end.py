@@ -655,8 +655,28 @@ def test_the_map_follows_poses_that_the_prior_changes_and_loops_of_the_graph_giv
     assert [node.pose is other.pose for node, other in zip(same.nodes, end.nodes, strict=True)] == [True, True]
 
 
+def test_a_window_factor_follows_what_the_prior_predicts_and_no_estimate(graph):
+    """Symptom: after an adjustment it had the difference of the estimates, which says nothing new of the path."""
+    state, poses = replace(state_of(ring()), time=jnp.asarray(3, jnp.int32)), [shifted(one) for one in (0.0, 1.0, 2.0)]
+    predicted = [shifted(0.0), shifted(1.1), shifted(2.2)]
+    rows = enumerate(zip(poses, predicted, strict=True))
+    nodes = tuple(Node(pose, pose, 0.0, row, predicted=one) for row, (pose, one) in rows)
+    window = Factor(2, 0, shifted(-2.2), 0.0, np.eye(7), is_loop=False, is_predicted=True)
+    chain = Factor(1, 0, shifted(-1.0), 0.0, np.eye(7), is_loop=False)
+    end = replace(BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01, nodes), factors=[window, chain])
+    after, _ = follow_prior(end, state, {2: shifted(2.6)}, np.eye(4))
+    np.testing.assert_allclose(after.factors[0].Z_a_b, shifted(-2.6))
+    assert after.factors[1] is chain, "of nodes that stay"
+    after, _ = follow_prior(end, state, {1: shifted(1.5)}, np.eye(4))
+    assert after.factors[0] is window, "the prior says of its two frames what it said"
+    np.testing.assert_allclose(after.factors[1].Z_a_b, shifted(-1.4))
+    unknown = replace(end, nodes=(replace(nodes[0], predicted=None), *nodes[1:]))
+    after, _ = follow_prior(unknown, state, {2: shifted(2.6)}, np.eye(4))
+    np.testing.assert_array_equal(after.factors[0].Z_a_b, window.Z_a_b)
+
+
 def shifted(*translation: float) -> np.ndarray:
     """A pose (4, 4) without rotation."""
     T = np.eye(4)
-    T[:3, 3] = translation
+    T[: len(translation), 3] = translation
     return T
