@@ -16,6 +16,8 @@ from emgs_jax.pose_graph.factors import Factors
 from emgs_jax.pose_graph.problem import bucket
 from emgs_jax.registration.pose_noise import LEAST_NOISE
 
+SAME = 1e-6  # by which a predicted pose may differ from itself: rounding
+
 
 @dataclass(frozen=True)
 class NoiseConfig:
@@ -49,6 +51,7 @@ class FrameData:
         mask: of these, (h, w).
         T_anchor_views: by frame index, the poses (4, 4) that its inference predicts; some may not be finite.
         covariance: (6, 6) of its pose, see `FrameRecord`; None without one.
+        world: of `T_anchor_views`, see `PriorPrediction`.
         depth_noise: ν, the points' difference from the map; None if the frame was not tracked, because a few points
             near the map by chance do not count.
     """
@@ -60,6 +63,12 @@ class FrameData:
     T_anchor_views: Mapping[int, np.ndarray]
     depth_noise: float | None = None
     covariance: np.ndarray | None = None
+    world: int = 0
+
+    @property
+    def predicted(self) -> np.ndarray | None:
+        """Its own predicted pose, in the prior's first world; None without one."""
+        return self.T_anchor_views.get(self.index) if self.world == 0 else None
 
     @property
     def depth(self) -> float:
@@ -154,6 +163,43 @@ def _offsets(frame: FrameData, time: int, is_connected: Callable[[int], bool]) -
     for offset in sorted(frame.index - index for index in known if frame.index in known):
         if 0 < offset <= time and is_connected(time - offset):
             yield offset
+
+
+def is_repeated(frame: FrameData, before: int, predicted: np.ndarray | None) -> bool:
+    """Test whether the inference of a registered frame repeats what another one predicted of the frame before.
+
+    The anchor's own pose, and frames from which a map was made together, show no repetition.
+
+    Args:
+        before: index of that frame.
+        predicted: its pose as predicted then.
+    """
+    again = frame.T_anchor_views.get(before)
+    if frame.depth_noise is None or frame.world != 0 or predicted is None or again is None:
+        return False
+    return bool(np.allclose(again, predicted, rtol=0, atol=SAME) and not np.array_equal(again, np.eye(4)))
+
+
+def with_disagreement(factor: Factor, T_a_b: np.ndarray, predicted: np.ndarray, depths: tuple[float, float]) -> Factor:
+    """Add to a factor's variances the mean square by which the estimated and the predicted relative pose differ.
+
+    A prior that has one pose for each frame repeats it, so the repetition does not show how accurate it is. Its path
+    and that of the map measure one motion, and by as much as they differ, one of them is wrong, whatever the depths'
+    noise. The mean is over the six axes, translations in median depths, because points at that depth tell a turn from
+    a shift only badly.
+
+    Args:
+        T_a_b: relative pose of the nodes (4, 4) as estimated, m of the map.
+        predicted: likewise, by the prior.
+        depths: the median depth that a sees, in units of its inference, and in m of the map.
+    """
+    if not np.isfinite(predicted).all():
+        return factor
+    error, (depth, depth_in_map) = np.linalg.inv(predicted) @ T_a_b, depths
+    turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
+    mean_square = np.mean(np.square([error[:3, 3] / depth_in_map, turn]))
+    added, weights = mean_square * np.square([depth] * 3 + [1.0] * 3 + [0.0]), np.diag(factor.sqrt_info)
+    return factor._replace(sqrt_info=np.diag(weights / np.sqrt(1.0 + weights**2 * added)))
 
 
 def chi2(measured: Factor | LoopMeasurement, poses: Sequence[np.ndarray], log_scales: Sequence[float]) -> float:
