@@ -17,6 +17,8 @@ from emgs_jax.pose_graph.factors import Factors
 from emgs_jax.pose_graph.problem import bucket
 from emgs_jax.registration.pose_noise import LEAST_NOISE
 
+SAME = 1e-6  # by which a predicted pose may differ from itself: rounding
+
 
 @dataclass(frozen=True)
 class NoiseConfig:
@@ -50,6 +52,7 @@ class FrameData:
         mask: of these, (h, w).
         T_anchor_views: by frame index, the poses (4, 4) that its inference predicts; some may not be finite.
         covariance: (6, 6) of its pose, see `FrameRecord`; None without one.
+        world: of `T_anchor_views`, see `PriorPrediction`.
         depth_noise: ν, the points' difference from the map; None if the frame was not tracked, because a few points
             near the map by chance do not count.
     """
@@ -61,6 +64,12 @@ class FrameData:
     T_anchor_views: Mapping[int, np.ndarray]
     depth_noise: float | None = None
     covariance: np.ndarray | None = None
+    world: int = 0
+
+    @property
+    def predicted(self) -> np.ndarray | None:
+        """Its own predicted pose, in the prior's first world; None without one."""
+        return self.T_anchor_views.get(self.index) if self.world == 0 else None
 
     @property
     def depth(self) -> float:
@@ -69,7 +78,11 @@ class FrameData:
 
 
 class Factor(NamedTuple):
-    """One row of `Factors`, on the host: Z (4, 4), sqrt_info (7, 7)."""
+    """One row of `Factors`, on the host: Z (4, 4), sqrt_info (7, 7).
+
+    Args:
+        is_predicted: Z is the prior's own prediction, not the difference of two estimated poses.
+    """
 
     a: int
     b: int
@@ -77,6 +90,7 @@ class Factor(NamedTuple):
     log_ratio: float
     sqrt_info: np.ndarray
     is_loop: bool
+    is_predicted: bool = False
 
 
 def _weights(frame: FrameData, noise: NoiseConfig, angle: float, log_scale: float = np.inf) -> np.ndarray:
@@ -144,7 +158,7 @@ def window_factor(
         return None
     measured = np.linalg.inv(frame.T_anchor_views[frame.index]) @ frame.T_anchor_views[frame.index - offset]
     weights = _weights(frame, noise, np.sqrt(offset) * noise.pair)
-    factor = Factor(time, time - offset, measured, 0.0, weights, is_loop=False)
+    factor = Factor(time, time - offset, measured, 0.0, weights, is_loop=False, is_predicted=True)
     return factor if chi2(factor, poses, log_scales) <= max_chi2 else None
 
 
@@ -154,6 +168,43 @@ def _offsets(frame: FrameData, time: int, is_connected: Callable[[int], bool]) -
     for offset in sorted(frame.index - index for index in known if frame.index in known):
         if 0 < offset <= time and is_connected(time - offset):
             yield offset
+
+
+def is_repeated(frame: FrameData, before: int, predicted: np.ndarray | None) -> bool:
+    """Test whether the inference of a registered frame repeats what another one predicted of the frame before.
+
+    The anchor's own pose, and frames from which a map was made together, show no repetition.
+
+    Args:
+        before: index of that frame.
+        predicted: its pose as predicted then.
+    """
+    again = frame.T_anchor_views.get(before)
+    if frame.depth_noise is None or frame.world != 0 or predicted is None or again is None:
+        return False
+    return bool(np.allclose(again, predicted, rtol=0, atol=SAME) and not np.array_equal(again, np.eye(4)))
+
+
+def with_disagreement(factor: Factor, T_a_b: np.ndarray, predicted: np.ndarray, depths: tuple[float, float]) -> Factor:
+    """Add to a factor's variances the mean square by which the estimated and the predicted relative pose differ.
+
+    A prior that has one pose for each frame repeats it, so the repetition does not show how accurate it is. Its path
+    and that of the map measure one motion, and by as much as they differ, one of them is wrong, whatever the depths'
+    noise. The mean is over the six axes, translations in median depths, because points at that depth tell a turn from
+    a shift only badly.
+
+    Args:
+        T_a_b: relative pose of the nodes (4, 4) as estimated, m of the map.
+        predicted: likewise, by the prior.
+        depths: the median depth that a sees, in units of its inference, and in m of the map.
+    """
+    if not np.isfinite(predicted).all():
+        return factor
+    error, (depth, depth_in_map) = np.linalg.inv(predicted) @ T_a_b, depths
+    turn = Rotation.from_matrix(error[:3, :3]).as_rotvec()
+    mean_square = np.mean(np.square([error[:3, 3] / depth_in_map, turn]))
+    added, weights = mean_square * np.square([depth] * 3 + [1.0] * 3 + [0.0]), np.diag(factor.sqrt_info)
+    return factor._replace(sqrt_info=np.diag(weights / np.sqrt(1.0 + weights**2 * added)))
 
 
 def chi2(measured: Factor | LoopMeasurement, poses: Sequence[np.ndarray], log_scales: Sequence[float]) -> float:
@@ -190,9 +241,25 @@ def shared_factor(a: Keyframe, b: Keyframe, depth_noise: float | None, noise: No
     return Factor(a.frame, b.frame, np.eye(4), ratio, weights, is_loop=False)
 
 
-def measured_again(factor: Factor, poses: Sequence[np.ndarray], log_scales: Sequence[float]) -> Factor:
-    """Return a factor, other than of a loop, with the relative pose that two nodes have now."""
-    return factor if factor.is_loop else factor._replace(Z_a_b=_relative_pose(poses, log_scales, factor.a, factor.b))
+def measured_again(
+    factor: Factor,
+    poses: Sequence[np.ndarray],
+    log_scales: Sequence[float],
+    predicted: Sequence[np.ndarray | None],
+) -> Factor:
+    """Return a factor with what its measurement is now: a loop's stays, a window factor's is the prior's prediction.
+
+    Any other has the relative pose of its nodes.
+
+    Args:
+        predicted: T_anchor_camera (4, 4) of all nodes, as the prior predicts them now; None without one.
+    """
+    a, b = predicted[factor.a], predicted[factor.b]
+    if factor.is_loop or (factor.is_predicted and (a is None or b is None)):
+        return factor
+    if factor.is_predicted:
+        return factor._replace(Z_a_b=np.linalg.inv(a) @ b)
+    return factor._replace(Z_a_b=_relative_pose(poses, log_scales, factor.a, factor.b))
 
 
 def _relative_pose(poses: Sequence[np.ndarray], log_scales: Sequence[float], a: int, b: int) -> np.ndarray:
@@ -209,7 +276,7 @@ def stack_factors(factors: Sequence[Factor]) -> Factors:
     """Stack factors as float32 arrays, padded to a power of two so that a growing graph compiles rarely."""
     count = len(factors)
     size = bucket(count)
-    a, b, Z, ratios, weights, is_loop = zip(*factors, *[factors[0]] * (size - count), strict=True)
+    a, b, Z, ratios, weights, is_loop, _ = zip(*factors, *[factors[0]] * (size - count), strict=True)
     return Factors(
         a=jnp.asarray(a, jnp.int32),
         b=jnp.asarray(b, jnp.int32),

@@ -73,7 +73,10 @@ def follow_prior(
         return replace(node, pose=T_world_anchor @ new @ beside)
 
     after = replace(end, nodes=tuple(map(moved, end.nodes)))
-    factors = [measured_again(factor, after.poses, after.log_scales) for factor in end.factors]
+    stays = [node is before for node, before in zip(after.nodes, end.nodes, strict=True)]
+    predicted = [node.predicted if stay else adjusted[node.frame] for node, stay in zip(end.nodes, stays, strict=True)]
+    known = after.poses, after.log_scales, predicted
+    factors = [one if stays[one.a] and stays[one.b] else measured_again(one, *known) for one in end.factors]
     nodes = nodes_of(end, end.active), nodes_of(after, end.active)
     return replace(after, factors=factors), deform_state(state, *nodes, end.min_std, end.config.deform)
 

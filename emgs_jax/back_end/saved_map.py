@@ -31,6 +31,7 @@ NODES = {
     "is_placed": "is_placed",
 }  # name in the file: of a node
 LOOPS = {"verified": "verified", "contradicted": "violating", "accepted": "accepted"}  # name in the file: in a back end
+OF_EDGES = Factor._fields[:-1]  # these nodes stay where they are, whatever the next run's prior predicts
 OF_POINTS, OF_KEYFRAMES = ("pixels", "descriptors", "points"), ("frame", "intrinsics", "size", "depths")
 
 
@@ -74,7 +75,7 @@ def save_places(path: Path, end: BackEnd, depth_noise: float) -> None:
     arrays |= {f"keyframes.{name}": np.stack([getattr(one, name) for one in keyframes]) for name in OF_KEYFRAMES}
     arrays |= {f"keyframes.{name}": np.concatenate([getattr(one, name) for one in keyframes]) for name in OF_POINTS}
     arrays["keyframes.num_points"] = np.array([len(one.pixels) for one in keyframes])
-    edges = _table("edges", end.factors, Factor.__annotations__)
+    edges = _table("edges", end.factors, OF_EDGES)
     arrays |= edges | {"edges.kind": edges.pop("edges.is_loop").astype(int)}
     for name, field in LOOPS.items():
         arrays |= _table(name, getattr(end, field), LoopMeasurement.__annotations__)
@@ -186,7 +187,7 @@ def _fields(arrays: Mapping[str, np.ndarray], num_trained: int) -> dict[str, Any
                 *(values.tolist() for values in (log_scales, frames, submaps, is_placed)),
             )
         ),
-        "factors": [Factor(**row) for row in _rows("edges", edges, Factor.__annotations__, count)],
+        "factors": [Factor(**row) for row in _rows("edges", edges, OF_EDGES, count)],
         "database": Database(keyframes, words, vectors, num_trained),
         "first_node": count,
         "connected_since": count,

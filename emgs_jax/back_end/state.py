@@ -11,7 +11,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from emgs_jax.back_end.factors import Factor, FrameData, NoiseConfig, map_factor, sequential_factor, window_factor
+from emgs_jax.back_end.factors import (
+    Factor,
+    FrameData,
+    NoiseConfig,
+    is_repeated,
+    map_factor,
+    sequential_factor,
+    window_factor,
+    with_disagreement,
+)
 from emgs_jax.geometry import Sim3, scale_covariance
 from emgs_jax.loop_closure.consistency import ConsistencyConfig
 from emgs_jax.loop_closure.place_recognition import Database, PlaceRecognitionConfig
@@ -62,7 +71,8 @@ class Node:
         covariance: (6, 6) of `online`, see `FrameRecord`; None without one, or in a saved map, which counts as exact.
         origin: node whose Gaussians it was registered to; None if it was not registered.
         depth_noise: difference of its points from the map, as a fraction of their depth; None if it was not registered.
-        predicted: T_anchor_camera (4, 4) as the prior predicted it; None without one, or in a saved map.
+        predicted: T_anchor_camera (4, 4) as the prior predicted it, in its first world; None without one, or in a saved
+            map.
     """
 
     pose: np.ndarray
@@ -155,7 +165,7 @@ def add_node(
     """
     time, pose = len(end.nodes), np.asarray(pose, np.float64)
     known = {"covariance": frame.covariance, "origin": origin, "depth_noise": frame.depth_noise}
-    known["predicted"] = frame.T_anchor_views.get(frame.index)
+    known["predicted"] = frame.predicted
     node = Node(pose, pose, float(np.log(scale)), frame.index, end.active, is_placed, **known)
     end = replace(end, nodes=(*end.nodes, node))
     if end.config is None:
@@ -167,7 +177,23 @@ def add_node(
         factors.append(map_factor(*known, origin, noise))
         if time - origin > (visit := float(end.config.deform.max_gap)):
             factors.append(window_factor(*known, is_connected, noise, (visit, end.config.min_violation)))
-    return replace(end, factors=[*end.factors, *filter(None, factors)])
+    factors, before = [*filter(None, factors)], end.nodes[time - 1]
+    if time and is_repeated(frame, before.frame, before.predicted):
+        factors = [_with_disagreement(end, factor, frame.depth) for factor in factors]
+    return replace(end, factors=[*end.factors, *factors])
+
+
+def _with_disagreement(end: BackEnd, factor: Factor, depth: float) -> Factor:
+    """Add the difference of map and prior to a new factor, see `with_disagreement`, if the prior knows both nodes.
+
+    Args:
+        depth: median depth that its first node sees, in units of its inference.
+    """
+    a, b = end.nodes[factor.a], end.nodes[factor.b]
+    if a.predicted is None or b.predicted is None:
+        return factor
+    estimated, predicted = np.linalg.inv(a.pose) @ b.pose, np.linalg.inv(a.predicted) @ b.predicted
+    return with_disagreement(factor, estimated, predicted, (depth, depth * math.exp(a.log_scale)))
 
 
 def _is_connected(end: BackEnd, row: int) -> bool:

@@ -7,21 +7,23 @@ import itertools
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import cv2
 
+from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.images import listed
 from emgs_jax.data.tones import read_shown
 from emgs_jax.data.video import VIDEO_SUFFIXES, Video
 from emgs_jax.io.npz import read_npz
-from emgs_jax.live.newest import Newest, Shot
+from emgs_jax.live.newest import Newest, Shot, Unread
 
 # Streams over TCP, each image as it comes: otherwise OpenCV lags by seconds (opencv#13145).
 OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 RTSP_OPTIONS = "rtsp_transport;tcp|fflags;nobuffer|flags;low_delay"
+ERRORS = OSError, ValueError, cv2.error  # of reading an image
 GIVEN = ("depth", "T_world_camera", "intrinsics", "confidence")  # arrays beside an image, as in files of prior=files
 
 
@@ -44,25 +46,25 @@ def is_ros(source: str) -> bool:
     return source.split()[:1] == ["ros"]
 
 
-def _offer(shots: Iterator[Shot], source: str, into: Newest) -> None:
+def _offer(shots: Iterator[Shot | Unread], source: str, into: Newest) -> None:
     try:
         for shot in shots:
             if not into.put(shot):
                 return
         into.end(f"camera {source} has ended")
-    except (OSError, ValueError, cv2.error) as error:
+    except ERRORS as error:
         into.end(f"camera {source} has failed: {error}")
     finally:
         shots.close()
 
 
-def open_source(source: str, into: Newest) -> Iterator[Shot]:
+def open_source(source: str, into: Newest) -> Iterator[Shot | Unread]:
     """Open a camera by its number or device, the address of a stream, a video or a recorded folder."""
     path = Path(source).expanduser()
     is_video = path.suffix.lower() in VIDEO_SUFFIXES and path.is_file()
     if path.is_dir() or is_video:
         into.can_wait = True
-        return _paced(_of_video(Video(path)) if is_video else _recorded(path), into.begun)
+        return _paced(_of_video(Video(path)) if is_video else _recorded(path, into), into.begun)
     capture = _stream(source) if "://" in source else cv2.VideoCapture(int(source) if source.isdecimal() else source)
     if not capture.isOpened():
         devices = ", ".join(str(device) for device in sorted(Path("/dev").glob("video*"))) or "none"
@@ -99,30 +101,39 @@ def _of_device(capture: cv2.VideoCapture) -> Iterator[Shot]:
         capture.release()
 
 
-def _of_video(video: Video) -> Iterator[tuple[float, Callable[[], Shot]]]:
+def _of_video(video: Video) -> Iterator[tuple[float, Shot]]:
+    """Yield all images: a video that skips some decodes them anyway."""
     for row, seconds in enumerate(video.times):
-        yield seconds, lambda row=row, seconds=seconds: Shot(seconds, video.read(row))
+        yield seconds, Shot(seconds, video.read(row))
 
 
-def _recorded(folder: Path) -> Iterator[tuple[float, Callable[[], Shot]]]:
-    """The images of a folder with what is beside them, by the times in their names."""
+def _recorded(folder: Path, into: Newest) -> Iterator[tuple[float, Unread]]:
+    """The images of a folder, by the times in their names; the first that cannot be read ends them."""
     for path, seconds in zip(*listed(folder)[:2], strict=True):
 
         def read(path: Path = path, seconds: float = seconds) -> Shot:
-            image, beside = read_shown(path, None, None), path.with_suffix(".npz")
-            given = None
-            if beside.is_file():
-                with beside.open("rb") as handle:
-                    given = read_npz(handle, (), GIVEN, may_be_compressed=True)
-            return Shot(seconds, image, given)
+            try:
+                return _read(path, seconds)
+            except ERRORS as error:
+                into.end(f"camera {folder} has failed: {error}")
+                raise BadFrameError(str(error)) from error
 
         yield seconds, read
 
 
-def _paced(shots: Iterator[tuple[float, Callable[[], Shot]]], begun: threading.Event) -> Iterator[Shot]:
+def _read(path: Path, seconds: float) -> Shot:
+    """Read an image with what is beside it."""
+    image, beside = read_shown(path, None, None), path.with_suffix(".npz")
+    given = None
+    if beside.is_file():
+        with beside.open("rb") as handle:
+            given = read_npz(handle, (), GIVEN, may_be_compressed=True)
+    return Shot(seconds, image, given)
+
+
+def _paced(shots: Iterator[tuple[float, Shot | Unread]], begun: threading.Event) -> Iterator[Shot | Unread]:
     """Yield the first image, and the others at the pace of their times once images are wanted."""
-    for number, (seconds, read) in enumerate(shots):
-        shot = read()
+    for number, (seconds, shot) in enumerate(shots):
         if number == 0:
             first = seconds
         elif number == 1:

@@ -3,9 +3,13 @@
 import threading
 import time
 import weakref
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
+
+from emgs_jax.data.base import BadFrameError
 
 
 @dataclass(frozen=True)
@@ -26,8 +30,11 @@ class Shot:
     arrived: float = 0.0
 
 
+Unread: TypeAlias = Callable[[], Shot]  # reads and decodes an image; BadFrameError if it cannot be used
+
+
 class Newest:
-    """The newest image of a source, until it is taken; those that newer ones replace are counted.
+    """The newest image of a source, until it is taken; those that newer ones replace are counted, and never read.
 
     Attributes:
         num_dropped: images that came and were not taken.
@@ -38,18 +45,18 @@ class Newest:
     """
 
     def __init__(self) -> None:
-        self._changed, self._shot = threading.Condition(), None
+        self._changed, self._shot = threading.Condition(), None  # the latter with the time when it came
         self.num_dropped, self.reason, self.problem = 0, None, None
         self.begun, self.can_wait = threading.Event(), False
         _running.add(self)
 
-    def put(self, shot: Shot) -> bool:
+    def put(self, shot: Shot | Unread) -> bool:
         """Offer an image; returns False if no more are wanted."""
         with self._changed:
             if self.reason is not None:
                 return False
             self.num_dropped += self._shot is not None
-            self._shot = replace(shot, arrived=time.monotonic())
+            self._shot = shot, time.monotonic()
             self._changed.notify_all()
             return True
 
@@ -60,10 +67,25 @@ class Newest:
             return self.reason is not None and self._shot is None
 
     def take(self, timeout_s: float | None) -> Shot | None:
-        """Wait for an image and take it; None after the last one, or if none comes in time (None: for ever)."""
-        with self._changed:
-            self._changed.wait_for(lambda: self._shot is not None or self.reason is not None, timeout_s)
-            shot, self._shot = self._shot, None
+        """Wait for an image, take and read it; None after the last one, or if none comes in time (None: for ever).
+
+        One that cannot be used is a `problem`, and the next one is waited for.
+        """
+        end = None if timeout_s is None else time.monotonic() + timeout_s
+        while True:
+            with self._changed:
+                rest = None if end is None else max(end - time.monotonic(), 0.0)
+                self._changed.wait_for(lambda: self._shot is not None or self.reason is not None, rest)
+                found, self._shot = self._shot, None
+            if found is None:
+                return None
+            shot, arrived = found
+            try:
+                shot = replace(shot if isinstance(shot, Shot) else shot(), arrived=arrived)
+            except BadFrameError as error:
+                self.problem = str(error)
+                continue
+            self.problem = None
             return shot
 
     def end(self, reason: str) -> None:

@@ -8,7 +8,7 @@ likewise: `odom_frame:=odom`.
 import contextlib
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from queue import Queue
 from types import ModuleType
@@ -96,17 +96,17 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
     def add(kind: str, message: Any) -> None:
         num_alone = joined.num_alone
         try:
-            value = frames.read(kind, message)
-        except (BadFrameError, ValueError) as error:
+            value = frames.read_pose(message) if kind == "pose" else message
+        except ValueError as error:
             into.problem = str(error)
             return
+        if kind == "image":
+            frames.see(message)
         put(joined.add(kind, stamp_of(message), value), num_alone)
 
     def put(whole: Iterator[tuple[float, dict[str, Any]]], num_alone: int) -> None:
         for time_s, found in whole:
-            given = {name: found[kind] for kind, name in GIVEN.items() if kind in found}
-            into.problem = None
-            into.put(Shot(time_s, found["image"], given or None))
+            into.put(partial(shot_of, time_s, found))
         if joined.num_alone > num_alone:
             into.problem = f"{joined.num_alone} images had no {' or '.join(sorted(kinds))} of their time"
             if odom_frame and not frames.transforms.way(frames.camera, odom_frame):
@@ -225,6 +225,17 @@ def pose_of(message: Any) -> np.ndarray:
     return rigid((place.x, place.y, place.z), (turn.x, turn.y, turn.z, turn.w))
 
 
+def shot_of(time_s: float, found: Mapping[str, Any]) -> Shot:
+    """Decode the messages of an image and its depth; BadFrameError if one is damaged or unknown."""
+    try:
+        image = image_of(found["image"])
+        given = {"depth": depth_of(found["depth"])} if "depth" in found else {}
+    except ValueError as error:
+        raise BadFrameError(str(error)) from error
+    given |= {"T_world_camera": found["pose"]} if "pose" in found else {}
+    return Shot(time_s, image, given or None)
+
+
 class Frames:
     """The frames of a robot: what `odometry` moves, and where the camera stands on it.
 
@@ -236,16 +247,19 @@ class Frames:
         self.transforms, self.camera = Transforms(), bare(camera)
         self._is_given = bool(camera)
 
-    def read(self, kind: str, message: Any) -> np.ndarray:
-        """Read a message of a kind in `READERS`; poses become those of the camera.
+    def see(self, message: Any) -> None:
+        """Learn the frame of the images from one of them."""
+        if not self._is_given:
+            self.camera = bare(message.header.frame_id)
+
+    def read_pose(self, message: Any) -> np.ndarray:
+        """Pose (4, 4) of the camera, of an Odometry.
 
         Raises:
             ValueError: the odometry is of another frame than the images, and none of /tf_static joins the two.
         """
-        value = READERS[kind](message)
-        if kind == "image" and not self._is_given:
-            self.camera = bare(message.header.frame_id)
-        if kind != "pose" or (self.camera and bare(message.child_frame_id) == self.camera):
+        value = pose_of(message)
+        if self.camera and bare(message.child_frame_id) == self.camera:
             return value
         if not self.camera:
             raise ValueError(
@@ -261,7 +275,3 @@ class Frames:
                 "(odom_frame:=odom in place of odometry)"
             )
         return value @ np.linalg.inv(T_root_moved) @ T_root_camera
-
-
-READERS = {"image": image_of, "depth": depth_of, "pose": pose_of}
-GIVEN = {"depth": "depth", "pose": "T_world_camera"}

@@ -61,7 +61,7 @@ class WindowInput:
     def data(self) -> list[FrameData]:
         """Parts of a frame that the back end needs."""
         return [
-            FrameData(frame.index, frame.image, raw.points, raw.mask, self.T_anchor_views)
+            FrameData(frame.index, frame.image, raw.points, raw.mask, self.T_anchor_views, world=self.world)
             for frame, raw in zip(self.frames, self.raw, strict=True)
         ]
 

@@ -55,7 +55,7 @@ class PriorPrediction:
         world: number of the poses' frame of reference, 0 for the first, which may come back. None: a new one begins
             where no view has a pose as before.
         adjusted: T_anchor_view (4, 4), in world 0, of frames before the current one whose poses are other ones than
-            when they were predicted: the map follows. Recordings have none.
+            when they were predicted: the map follows. Only of priors with `adjusts_poses`.
     """
 
     window: Window
@@ -86,6 +86,7 @@ class Prior(ABC):
     feature_names: tuple[str, ...] = ()  # classes that `text_features` describes
     # (classes, f) unit embeddings, comparable with `PriorPrediction.features`
     text_features: np.ndarray = np.zeros((0, 0), np.float32)
+    adjusts_poses: bool = False  # later predictions change poses of earlier ones, see `PriorPrediction.adjusted`
 
     @abstractmethod
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:

@@ -111,7 +111,16 @@ def record(
     folder: Path | str,
     progress: Callable[[Sequence[Window]], Iterable[Window]] = iter,
 ) -> None:
-    """Write the predictions of every window of a data set, keeping those that exist; `progress` is tqdm or the like."""
+    """Write the predictions of every window of a data set, keeping those that exist; `progress` is tqdm or the like.
+
+    Raises:
+        ValueError: the prior adjusts poses that it has predicted, which a recording cannot hold.
+    """
+    if prior.adjusts_poses:
+        raise ValueError(
+            "prior.structure.online=true adjusts earlier poses, and a recording cannot hold that: record with "
+            "prior.structure.online=false, which sees all images at once, or map without a recording (emgs run)"
+        )
     folder = Path(folder)
     calls = list(calls_of(prior, dataset, window_size))
     header = {

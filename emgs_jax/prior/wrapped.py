@@ -16,7 +16,7 @@ class Wrapped(Prior):
     """A prior that delegates to another one, except for what a subclass changes."""
 
     def __init__(self, prior: Prior) -> None:
-        self._prior, self.provenance = prior, prior.provenance
+        self._prior, self.provenance, self.adjusts_poses = prior, prior.provenance, prior.adjusts_poses
         self.feature_names, self.text_features = prior.feature_names, prior.text_features
 
     def num_newer(self, window_size: int) -> int:

@@ -20,6 +20,7 @@ from emgs_jax.back_end.factors import (
     sequential_factor,
     stack_factors,
     window_factor,
+    with_disagreement,
 )
 from emgs_jax.back_end.loops import (
     consistent_loops,
@@ -514,6 +515,76 @@ def test_loops_that_correct_the_path_of_given_poses_close(graph, kind, tmp_path)
     assert error(end.poses, truth) < 0.5 * error(drifted, truth)
 
 
+def walked_by(graph, poses: np.ndarray, predicted: np.ndarray, **known) -> BackEnd:
+    """A walk with exact depths: each frame registered to the one three before it."""
+    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01)
+    for index, pose in enumerate(poses):
+        frame = replace(look(predicted, index), depth_noise=0.002 if index else None, **known)
+        end = add_node(end, frame, pose, 1.0, max(index - 3, 0))
+    return end
+
+
+def test_exact_depths_do_not_make_a_path_sure_that_odometry_contradicts(graph):
+    """Symptom: true loops were accepted and hardly moved the poses, which were as sure as the depths were exact."""
+    truth, placed, odometry = ring(), ring(1.95 * np.pi), ring(2.05 * np.pi)
+    loops = [loop(truth, row) for row in range(1, 9)]
+    end, _ = close_loops(walked_by(graph, placed, odometry), state_of(placed), loops)
+    assert len(end.accepted) == 8 and error(end.poses, truth) < 0.5 * error(placed, truth)
+    as_sure, _ = close_loops(walked_by(graph, placed, placed), state_of(placed), loops)
+    assert error(as_sure.poses, truth) > 0.8 * error(placed, truth), "odometry and map agree"
+
+
+def test_what_map_and_odometry_differ_by_is_a_factors_error(graph):
+    """In units of depth and rad, the mean over six axes; a scale is not compared."""
+    placed, odometry = ring(), ring(2.05 * np.pi)
+    end, same = walked_by(graph, placed, odometry), walked_by(graph, placed, placed)
+    for factor, other in zip(end.factors[-2:], same.factors[-2:], strict=True):
+        off = np.linalg.inv(np.linalg.inv(odometry[factor.a]) @ odometry[factor.b])
+        off = off @ np.linalg.inv(placed[factor.a]) @ placed[factor.b]
+        turn = 0.05 * np.pi / (COUNT - 1) * (factor.a - factor.b)
+        added = (np.sum(off[:3, 3] ** 2) + turn**2) / 6
+        variances, before = (1 / np.diag(one.sqrt_info)[:6] ** 2 for one in (factor, other))
+        np.testing.assert_allclose(variances, before + added, rtol=1e-3)
+        assert factor.sqrt_info[6, 6] == other.sqrt_info[6, 6]
+        np.testing.assert_array_equal(factor.Z_a_b, other.Z_a_b)
+
+
+def test_a_difference_from_the_prior_counts_in_the_unit_of_the_inference(graph):
+    """Points that look twice as far in an inference whose unit is half as long: all lengths are twice as long."""
+    frame = replace(look(ring(), 30), points=np.full((4, 4, 3), 5.0), mask=np.ones((4, 4), bool), depth_noise=0.002)
+    factor = sequential_factor(frame, list(ring()[:31]), [0.0] * 31, anywhere, graph.noise)
+    T, predicted = (np.linalg.inv(poses[30]) @ poses[29] for poses in (ring(), ring(2.05 * np.pi)))
+    in_metres, in_halves = (with_disagreement(factor, T, predicted, (depth, 5.0)) for depth in (5.0, 10.0))
+    as_long = 1 / np.diag(factor.sqrt_info)[:3] ** 2
+    longer, doubled = (1 / np.diag(one.sqrt_info)[:3] ** 2 - as_long for one in (in_metres, in_halves))
+    np.testing.assert_allclose(doubled, 4 * longer)
+    np.testing.assert_allclose(np.diag(in_halves.sqrt_info)[3:], np.diag(in_metres.sqrt_info)[3:])
+    unknown = with_disagreement(factor, T, np.full((4, 4), np.nan), (5.0, 5.0))
+    np.testing.assert_array_equal(unknown.sqrt_info, factor.sqrt_info)
+
+
+@pytest.mark.parametrize("kind", ["drawn anew", "in another world", "lost before", "of one inference"])
+def test_only_a_repeated_prediction_is_compared_with_the_map(graph, kind):
+    """A network that predicts a frame anew shows by that how noisy it is, and `graph.noise` holds for it."""
+    placed, odometry = ring(), ring(2.05 * np.pi)
+    before = walked_by(graph, placed[:30], odometry)
+    frame = replace(look(odometry, 30), depth_noise=0.002)
+    compared = add_node(before, frame, placed[30], 1.0, 27).factors[-2]
+    if kind == "drawn anew":
+        views = {i: pose @ shifted(0.001) for i, pose in frame.T_anchor_views.items()}
+        frame = replace(frame, T_anchor_views=views)
+    elif kind == "in another world":
+        frame = replace(frame, world=1)
+    elif kind == "lost before":
+        frame.T_anchor_views[29][:] = np.nan
+    else:
+        frame = replace(frame, depth_noise=None)
+    factor = add_node(before, frame, placed[30], 1.0, 27).factors[-2]
+    weights = np.diag(sequential_factor(frame, list(placed[:31]), [0.0] * 31, anywhere, graph.noise).sqrt_info)
+    np.testing.assert_allclose(np.diag(factor.sqrt_info), weights)
+    assert not np.allclose(np.diag(compared.sqrt_info), weights)
+
+
 def test_a_loop_of_another_place_is_refused_by_the_prior(graph, drifted):
     end = query_prior(drifted, drifted.verified[:1], told_again(ring(), off=6.0)[0])
     assert [known.a for known in end.verified] == [2, 3, 4] and [known.a for known in end.violating] == [1]
@@ -655,8 +726,28 @@ def test_the_map_follows_poses_that_the_prior_changes_and_loops_of_the_graph_giv
     assert [node.pose is other.pose for node, other in zip(same.nodes, end.nodes, strict=True)] == [True, True]
 
 
+def test_a_window_factor_follows_what_the_prior_predicts_and_no_estimate(graph):
+    """Symptom: after an adjustment it had the difference of the estimates, which says nothing new of the path."""
+    state, poses = replace(state_of(ring()), time=jnp.asarray(3, jnp.int32)), [shifted(one) for one in (0.0, 1.0, 2.0)]
+    predicted = [shifted(0.0), shifted(1.1), shifted(2.2)]
+    rows = enumerate(zip(poses, predicted, strict=True))
+    nodes = tuple(Node(pose, pose, 0.0, row, predicted=one) for row, (pose, one) in rows)
+    window = Factor(2, 0, shifted(-2.2), 0.0, np.eye(7), is_loop=False, is_predicted=True)
+    chain = Factor(1, 0, shifted(-1.0), 0.0, np.eye(7), is_loop=False)
+    end = replace(BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01, nodes), factors=[window, chain])
+    after, _ = follow_prior(end, state, {2: shifted(2.6)}, np.eye(4))
+    np.testing.assert_allclose(after.factors[0].Z_a_b, shifted(-2.6))
+    assert after.factors[1] is chain, "of nodes that stay"
+    after, _ = follow_prior(end, state, {1: shifted(1.5)}, np.eye(4))
+    assert after.factors[0] is window, "the prior says of its two frames what it said"
+    np.testing.assert_allclose(after.factors[1].Z_a_b, shifted(-1.4))
+    unknown = replace(end, nodes=(replace(nodes[0], predicted=None), *nodes[1:]))
+    after, _ = follow_prior(unknown, state, {2: shifted(2.6)}, np.eye(4))
+    np.testing.assert_array_equal(after.factors[0].Z_a_b, window.Z_a_b)
+
+
 def shifted(*translation: float) -> np.ndarray:
     """A pose (4, 4) without rotation."""
     T = np.eye(4)
-    T[:3, 3] = translation
+    T[: len(translation), 3] = translation
     return T

@@ -188,18 +188,18 @@ def test_odometry_of_the_base_becomes_that_of_the_camera_where_tf_says_how_it_is
     image = message(RGB, "rgb8")
     image.header = SimpleNamespace(frame_id="camera_optical")
     with pytest.raises(ValueError, match="no image has come whose header names a frame"):
-        frames.read("pose", odometry(T_odom_base, "base_link"))
-    frames.read("image", image)
+        frames.read_pose(odometry(T_odom_base, "base_link"))
+    frames.see(image)
     with pytest.raises(ValueError, match="odometry is of the frame base_link, images are of camera_optical"):
-        frames.read("pose", odometry(T_odom_base, "base_link"))
-    np.testing.assert_allclose(frames.read("pose", odometry(T_odom_base, "camera_optical")), T_odom_base, atol=1e-12)
+        frames.read_pose(odometry(T_odom_base, "base_link"))
+    np.testing.assert_allclose(frames.read_pose(odometry(T_odom_base, "camera_optical")), T_odom_base, atol=1e-12)
     links = [("base_link", "mast", T_base_mast), ("/mast", "/camera_optical", T_mast_camera)]
     frames.transforms.add_fixed(transforms(links))
     expected = T_odom_base @ T_base_mast @ T_mast_camera
-    np.testing.assert_allclose(frames.read("pose", odometry(T_odom_base, "base_link")), expected, atol=1e-12)
+    np.testing.assert_allclose(frames.read_pose(odometry(T_odom_base, "base_link")), expected, atol=1e-12)
     # Of a frame below the base that is no ancestor of the camera.
     frames.transforms.add_fixed(transforms([("base_link", "imu", random_pose(5))]))
-    found = frames.read("pose", odometry(T_odom_base @ random_pose(5), "imu"))
+    found = frames.read_pose(odometry(T_odom_base @ random_pose(5), "imu"))
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 

@@ -12,6 +12,7 @@ from emgs_jax.prior.base import visits, windows
 from emgs_jax.prior.recorded import Recorded, record
 from emgs_jax.prior.recorded_visits import record_visits
 from emgs_jax.prior.simulated.prior import Simulated
+from emgs_jax.prior.wrapped import Wrapped
 
 WINDOW_SIZE = 3
 
@@ -113,6 +114,15 @@ class Sure(Simulated):
         found = super().predict(window, frames, intrinsics)
         covariance = np.multiply.outer(1.0 + np.arange(len(window.views)), 1e-4 * np.eye(6))
         return replace(found, pose_covariance=covariance, scale_std=np.float64(0.02))
+
+
+def test_a_prior_that_adjusts_poses_is_not_recorded(prior, room, tmp_path):
+    """Symptom: the recording of an online structure lacked the adjusted poses, and its map was another one."""
+    prior.adjusts_poses = True
+    for one in (prior, Wrapped(prior)):
+        with pytest.raises(ValueError, match=r"recording cannot hold that: record with prior\.structure\.online=false"):
+            record(one, room, WINDOW_SIZE, tmp_path / "recording")
+    assert not (tmp_path / "recording").exists() and prior.num_calls == 0
 
 
 def test_how_sure_poses_are_is_replayed_and_what_the_key_says_stands_in_its_place(tmp_path, room):

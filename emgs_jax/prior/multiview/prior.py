@@ -75,6 +75,7 @@ class MultiviewStereo(Prior):
 
     def __init__(self, structure: StructureConfig, dense: AnyDense, metres: ScaleConfig) -> None:
         self._config, self._dense, self._way, self._metres = structure, dense, way_of(dense), metres
+        self.adjusts_poses = structure.online
         if structure.online and (self._way.needs_all or structure.model is not None or metres.is_given):
             key = "scale=" if metres.is_given else "this prior/dense"
             key = "prior.structure.model" if structure.model is not None else key
