@@ -64,15 +64,12 @@ OPEN = ("baseline", "variants", "tolerances", "suite")  # nodes that take any na
 NO_WORD = (ValueError, TypeError, AssertionError)  # raised by Hydra if an option of a group is no word
 
 
-def in_unit_of(prior: Prior, config: DictConfig) -> DictConfig:
-    """Return the config with its lengths in the unit of a prior, see `Prior.metre`; it says so."""
-    if prior.metre == 1:
-        return config
-    lengths = {key: prior.metre * OmegaConf.select(config, key) for key in LENGTHS}
+def in_unit(config: DictConfig, metre: float) -> DictConfig:
+    """Return a config of a run whose lengths are in a unit in which one of their metres is `metre` long."""
+    lengths = {key: metre * OmegaConf.select(config, key) for key in LENGTHS}
     config = copy.deepcopy(config)
     for key, value in lengths.items():
         OmegaConf.update(config, key, value)
-    tqdm.write(f"lengths of slam= and densify= are {prior.metre:.3g} times as large, for the unit of the prior")
     return config
 
 

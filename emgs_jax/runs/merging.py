@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.back_end.saved_map import PLACES_FILE, SavedMap, first_node_of, load_places
 from emgs_jax.back_end.state import BackEnd, Node
-from emgs_jax.config.configure import CONF, build, build_dataset, compose, graph_config, message_of
+from emgs_jax.config.configure import CONF, build, build_dataset, compose, graph_config, in_unit, message_of
 from emgs_jax.data.joined import common_camera, joined_name
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
@@ -64,8 +64,8 @@ def mergeable(folder: Path) -> MergeableRun:
 
 
 def config_of(run: FinishedRun) -> DictConfig:
-    """Return the config of a run, with infinities, which metrics.json cannot hold."""
-    return compose(*repeat(run.provenance["config"]).words)
+    """Return the config of a run, with infinities, which metrics.json cannot hold, and lengths in the map's unit."""
+    return in_unit(compose(*repeat(run.provenance["config"]).words), run.provenance.get("metre", 1.0))
 
 
 def record_of(line: Mapping[str, Any], pose: np.ndarray) -> FrameRecord:

@@ -16,6 +16,8 @@ from emgs_jax.config.configure import build_prior
 from emgs_jax.prior.base import windows
 from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.prior.wrapped import Wrapped
+from emgs_jax.runs.finished_run import read_run
+from emgs_jax.runs.merging import config_of
 from experiments.predict import predict
 from experiments.run import run
 
@@ -106,7 +108,7 @@ def test_a_map_in_another_unit_is_the_same_map(tmp_path, exact_run, monkeypatch,
         words = "prior=recorded", f"prior.folder={folder}"
     (tmp_path / "run").mkdir()
     metrics = run(compose(*words), tmp_path / "run")
-    assert "are 4 times as large, for the unit of the prior" in "".join(capsys.readouterr())
+    assert "count 4 times, for the unit of the prior" in "".join(capsys.readouterr())
     there, here = np.load(tmp_path / "run" / "map.npz"), np.load(exact_run[0] / "map.npz")
     (means, stds), (others, expected) = (
         (found["gaussians.means"][rows], np.sqrt(np.linalg.eigvalsh(found["gaussians.covs"][rows])[:, 0]))
@@ -116,5 +118,6 @@ def test_a_map_in_another_unit_is_the_same_map(tmp_path, exact_run, monkeypatch,
     first = np.loadtxt(exact_run[0] / "trajectory.txt")[0, 1:4]  # where both maps begin
     assert np.mean(cKDTree(first + 4 * (others - first)).query(means)[0] < 0.02) > 0.75
     assert np.median(stds) == pytest.approx(4 * np.median(expected), rel=0.05)
-    settings = metrics["provenance"]["config"]
-    assert settings["slam"]["fit"]["min_std"] == settings["densify"]["min_std"] == 4 * compose().slam.fit.min_std
+    assert metrics["provenance"]["metre"] == 4.0 and metrics["provenance"]["config"]["slam"]["fit"]["min_std"] == 0.01
+    again = config_of(read_run(tmp_path / "run"))
+    assert again.slam.em.min_std == again.densify.min_std == 0.04 and again.slam.submap.margin == 0.4
