@@ -153,9 +153,9 @@ def _nearest_sheet(
 ) -> tuple[Int[Array, "n"], Bool[Array, "n"]]:
     """Find for every Gaussian a heavier one that is another sheet of its surface, and whether there is one.
 
-    Let g be the gap along n, the mean of both normals, and σ_i² = (ν d_i)² + n'Σ_i n, with d_i the distance of camera i
-    from the plane of Gaussian i. They are sheets if g² > `MIN_GAP`² n'Σn of either, so that they are not one thick
-    sheet, g² <= `MAX_APART_SQ` (σ_a² + σ_b²), and the ray from the camera that made the one behind crosses the one in
+    Let g be the gap along n, the mean of both normals, and σ_i = ν d_i, with d_i the distance of camera i from the
+    plane of Gaussian i. They are sheets if g² > `MIN_GAP`² n'Σn of either, so that they are not one thick sheet,
+    g² <= `MAX_APART_SQ` (σ_a² + σ_b²), and the ray from the camera that made the one behind crosses the one in
     front within `MAX_CROSSING_SQ`. The nearest is that of the smallest sum of both squared distances.
     """
     gaussians, count = map.gaussians, origins.shape[0]
@@ -173,7 +173,7 @@ def _nearest_sheet(
         thickness = [quadratic(lower_entries(gaussians.covs[i]), jnp.unstack(normal, axis=-1)) for i in (own, near)]
         noise = [depth_noise * _inner(normal, gaussians.means[i] - origins[i]) for i in (own, near)]
         is_behind = gap**2 > MIN_GAP**2 * jnp.maximum(*thickness)
-        apart_sq = gap**2 / (sum(thickness) + noise[0] ** 2 + noise[1] ** 2)
+        apart_sq = gap**2 / (noise[0] ** 2 + noise[1] ** 2)
 
         front, behind = jnp.where(gap > 0, near, own), jnp.where(gap > 0, own, near)
         ray = gaussians.means[behind] - origins[behind]

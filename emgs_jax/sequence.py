@@ -74,9 +74,8 @@ def map_sequence(config: RunConfig, show_progress: bool = True, **stages: Stage)
     use_compilation_cache(settings.compilation_cache)
     dataset = build_dataset(settings)
     prior = build_prior(settings, dataset)
-    saved = load_saved_map(
-        settings.map, settings.map_mode, config.graph, dataset.intrinsics, float(config.slam.fit.min_std)
-    )
+    slam = slam.in_unit(prior.metre)
+    saved = load_saved_map(settings.map, settings.map_mode, config.graph, dataset.intrinsics, float(slam.fit.min_std))
     with (
         Clock().watching() as clock,
         tqdm(total=dataset.total, unit="frame", desc="mapping", disable=not show_progress) as bar,

@@ -108,6 +108,15 @@ class SlamConfig(eqx.Module):
     motion: MotionConfig
     stages: Stages = eqx.field(static=True, default=Stages())
 
+    def in_unit(self, metre: float) -> "SlamConfig":
+        """Return the config with its lengths in a unit in which one of their metres is `metre` long."""
+
+        def lengths(config: "SlamConfig") -> tuple:
+            stds = (stage.min_std for stage in (config.fit, config.em, config.splitting))
+            return *stds, config.submap.voxel_size, config.submap.margin
+
+        return eqx.tree_at(lengths, self, replace_fn=lambda length: metre * length)
+
     @property
     def fusion(self) -> "FusionConfig":
         """Settings of the fusion only, so that changing others does not compile it again."""

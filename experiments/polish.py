@@ -5,7 +5,7 @@ from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
 
-from emgs_jax.config.configure import build, in_unit
+from emgs_jax.config.configure import build
 from emgs_jax.io.files import check_writable, owned
 from emgs_jax.report.page import write_report
 from emgs_jax.report.printout import polish_lines
@@ -25,9 +25,9 @@ def polish_run(config: DictConfig) -> dict[str, Any]:
     if dataset is None:
         raise ValueError(f"{note} They are what splats are fitted to.")
     check_writable(run.folder, f"folder={run.folder}")
-    settings = in_unit(OmegaConf.create(dict(run.provenance["config"])), run.provenance.get("metre", 1.0))
+    settings = OmegaConf.create(dict(run.provenance["config"]))
     with owned(run.folder):
-        found = polish(run, dataset, fitting, build(settings, "densify"))
+        found = polish(run, dataset, fitting, build(settings, "densify").in_unit(run.metre))
         write_report(run, dataset)
     return found
 

@@ -12,7 +12,7 @@ from omegaconf import DictConfig, OmegaConf
 from tqdm import tqdm
 
 from emgs_jax.back_end.saved_map import load_saved_map
-from emgs_jax.config.configure import baseline_configs, build, build_dataset, build_prior, graph_config, in_unit
+from emgs_jax.config.configure import baseline_configs, build, build_dataset, build_prior, graph_config
 from emgs_jax.config.values import check_values
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.device.clock import Clock
@@ -92,8 +92,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
                     tqdm.write("compiling before the first image is taken …")
                     prepared()
             prior.keep(folder)
+            slam, densify = slam.in_unit(prior.metre), densify.in_unit(prior.metre)
             if prior.metre != 1:
-                slam, densify = (build(in_unit(config, prior.metre), name) for name in ("slam", "densify"))
                 tqdm.write(f"lengths of slam= and densify= count {prior.metre:.3g} times, for the unit of the prior")
             saved = load_saved_map(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
             session = new_run(dataset, slam, clock, graph=graph, saved=saved)

@@ -43,10 +43,7 @@ def lengths(tree, s):
 
 
 def config(s):
-    return sc.changed(
-        CONFIG,
-        **{f"{stage}.min_std": s * float(getattr(CONFIG, stage).min_std) for stage in ("fit", "em", "splitting")},
-    )
+    return CONFIG.in_unit(s)
 
 
 def seen(seed):

@@ -56,21 +56,8 @@ RENAMED = {  # keys of earlier versions; the longest match counts
     "prior.structure.masks": "masks.folder",
     "prior.dense.depth.depth_step": "prior.dense.depth_step",
 }
-LENGTHS = (
-    *(f"slam.{stage}.min_std" for stage in ("fit", "em", "splitting")),
-    *("densify.min_std", "slam.submap.voxel_size", "slam.submap.margin"),
-)
 OPEN = ("baseline", "variants", "tolerances", "suite")  # nodes that take any name
 NO_WORD = (ValueError, TypeError, AssertionError)  # raised by Hydra if an option of a group is no word
-
-
-def in_unit(config: DictConfig, metre: float) -> DictConfig:
-    """Return a config of a run whose lengths are in a unit in which one of their metres is `metre` long."""
-    lengths = {key: metre * OmegaConf.select(config, key) for key in LENGTHS}
-    config = copy.deepcopy(config)
-    for key, value in lengths.items():
-        OmegaConf.update(config, key, value)
-    return config
 
 
 def build(config: DictConfig, key: str, **more: Any) -> Any:

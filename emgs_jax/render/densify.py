@@ -45,6 +45,10 @@ class DensifyConfig(eqx.Module):
     surface_depth: Float[Array, "*b"] = traced(0.05, low=0)
     min_alpha: Float[Array, "*b"] = traced(0.3, low=0, high=1)
 
+    def in_unit(self, metre: float) -> "DensifyConfig":
+        """Return the config with its lengths in a unit in which one of their metres is `metre` long."""
+        return eqx.tree_at(lambda config: config.min_std, self, metre * self.min_std)
+
 
 class DenseView(eqx.Module):
     """Points of one view, world frame; rows of invalid pixels hold arbitrary finite values.

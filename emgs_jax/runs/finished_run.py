@@ -72,6 +72,11 @@ class FinishedRun:
         return np.array([frame["status"] not in UNPLACED for frame in self.frames], bool)
 
     @property
+    def metre(self) -> float:
+        """What a metre of the settings was in the unit of the map, see `Prior.metre`."""
+        return self.provenance.get("metre", 1.0)
+
+    @property
     def is_metric(self) -> bool:
         """Whether lengths of the map are meant to be metres."""
         return is_metric(self.provenance["prior"]["settings"])

@@ -11,7 +11,7 @@ from omegaconf import DictConfig, OmegaConf
 
 from emgs_jax.back_end.saved_map import PLACES_FILE, SavedMap, first_node_of, load_places
 from emgs_jax.back_end.state import BackEnd, Node
-from emgs_jax.config.configure import CONF, build, build_dataset, compose, graph_config, in_unit, message_of
+from emgs_jax.config.configure import CONF, build, build_dataset, compose, graph_config, message_of
 from emgs_jax.data.joined import common_camera, joined_name
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
@@ -50,7 +50,7 @@ def mergeable(folder: Path) -> MergeableRun:
     """Read a finished run; raise ValueError if it has no keyframes for place recognition."""
     run = read_run(folder)
     config = config_of(run)
-    slam, graph = build(config, "slam"), graph_config(config)
+    slam, graph = build(config, "slam").in_unit(run.metre), graph_config(config)
     if graph is None or run.online is None or not (folder / PLACES_FILE).is_file():
         raise ValueError(
             f"{folder} has no keyframes of its own by which its places are found: map it again with graph=default"
@@ -64,8 +64,8 @@ def mergeable(folder: Path) -> MergeableRun:
 
 
 def config_of(run: FinishedRun) -> DictConfig:
-    """Return the config of a run, with infinities, which metrics.json cannot hold, and lengths in the map's unit."""
-    return in_unit(compose(*repeat(run.provenance["config"]).words), run.provenance.get("metre", 1.0))
+    """Return the config of a run, with infinities, which metrics.json cannot hold."""
+    return compose(*repeat(run.provenance["config"]).words)
 
 
 def record_of(line: Mapping[str, Any], pose: np.ndarray) -> FrameRecord:
@@ -272,7 +272,8 @@ def save_merged(
     repeated = [row for row, one in enumerate(found.kept) if row != one]
     origin, dataset, note = _origin(parts, (has_truth, repeated), "own" if keeps_points else "map")
     config = config_of(parts[0])
-    densify, evaluation = replace(build(config, "densify"), points="map"), build(config, "evaluation")
+    densify, evaluation = build(config, "densify").in_unit(parts[0].metre), build(config, "evaluation")
+    densify = replace(densify, points="map")
     (width, height), (fx, fy, cx, cy) = origin["data"]["frames"].values()
     run = replace(run, atlas=replace(run.atlas, camera=Camera((fx, fy), (cx, cy), width, height)))
     with FrameLog(folder / FRAMES_FILE) as log:

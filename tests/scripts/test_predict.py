@@ -17,7 +17,6 @@ from emgs_jax.prior.base import windows
 from emgs_jax.prior.simulated.prior import Simulated
 from emgs_jax.prior.wrapped import Wrapped
 from emgs_jax.runs.finished_run import read_run
-from emgs_jax.runs.merging import config_of
 from experiments.predict import predict
 from experiments.run import run
 
@@ -119,5 +118,4 @@ def test_a_map_in_another_unit_is_the_same_map(tmp_path, exact_run, monkeypatch,
     assert np.mean(cKDTree(first + 4 * (others - first)).query(means)[0] < 0.02) > 0.75
     assert np.median(stds) == pytest.approx(4 * np.median(expected), rel=0.05)
     assert metrics["provenance"]["metre"] == 4.0 and metrics["provenance"]["config"]["slam"]["fit"]["min_std"] == 0.01
-    again = config_of(read_run(tmp_path / "run"))
-    assert again.slam.em.min_std == again.densify.min_std == 0.04 and again.slam.submap.margin == 0.4
+    assert read_run(tmp_path / "run").metre == 4.0
