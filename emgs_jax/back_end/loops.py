@@ -1,7 +1,7 @@
 """Loops: detect them by keyframes, verify them, query the prior, and check spatial consistency."""
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 
 from emgs_jax.back_end.factors import FrameData, chi2
@@ -36,19 +36,19 @@ def detect_loops(end: BackEnd, frame: FrameData) -> BackEnd:
     return end
 
 
-def detect_loops_between(end: BackEnd, submap_id: int, shared: Collection[int] = ()) -> BackEnd:
+def detect_loops_between(end: BackEnd, submap_id: int, is_one_walk: bool = False) -> BackEnd:
     """Verify loops between the keyframes of a submap, whose unit may differ, and those of the active one.
 
-    The submap's nodes come after those of the active one. Its `shared` nodes, if any, are of images of the active
-    one, too: both are of one walk, and its other nodes have the candidates that they would have in one run.
+    The submap's nodes come after those of the active one. If both are of one walk, these keyframes have the candidates
+    that they would have in one run.
     """
     config, is_placed = end.config.place_recognition, [end.nodes[one.frame].is_placed for one in end.database.keyframes]
     known, queries = (
         [row for row, ok in enumerate(is_placed) if ok and _submap_id_of(end, row) == number]
         for number in (end.active, submap_id)
     )
-    for row in (row for row in queries if end.database.keyframes[row].frame not in shared):
-        if shared:
+    for row in queries:
+        if is_one_walk:
             candidates = [one for one in propose_candidates(end.database, row, config) if one in known]
         else:
             candidates = most_similar(end.database, end.database.keyframes[row], known, config.num_candidates, config)

@@ -6,7 +6,7 @@ these say where the other map is.
 """
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import is_dataclass, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from emgs_jax.back_end.saved_map import LEFT_OUT
 from emgs_jax.back_end.state import BackEnd, Node, transform_nodes
 from emgs_jax.gaussian_map import transformed
 from emgs_jax.geometry import Sim3, scale_pose
-from emgs_jax.loop_closure.place_recognition import train_database
+from emgs_jax.loop_closure.place_recognition import Database, train_database
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.mapping.atlas import Atlas, Submap, with_state
 from emgs_jax.mapping.capacity import add_map
@@ -47,7 +47,10 @@ def join(atlas: Atlas, other: Atlas, shared: Sequence[tuple[int, int]] = ()) -> 
     number = max(both.submaps)
     first, begin = both.graph.first_node, len(both.graph.nodes) - len(other.graph.nodes) + other.graph.first_node
     factors = shared_factors(both.graph, [(first + a, begin + b) for a, b in shared])
-    graph = detect_loops_between(both.graph, number, {factor.b for factor in factors})
+    # An image is a keyframe once: the first frames of a walk's part are the worse candidates.
+    is_repeated = {factor.b for factor in factors}
+    database = keyframes_but(both.graph.database, is_repeated)
+    graph = detect_loops_between(replace(both.graph, database=database), number, is_one_walk=bool(factors))
     found = shared_placement(graph, number, factors) if factors else placement(graph, number)
     if isinstance(found, str):
         return found
@@ -108,15 +111,18 @@ def without_repeats(atlas: Atlas, kept: Sequence[int]) -> Atlas:
     first = atlas.graph.first_node
     stays = [True] * first + [row == one for row, one in enumerate(kept)]
     place = np.cumsum(stays) - 1
+    is_repeated = {row for row, ok in enumerate(stays) if not ok}
+    atlas = replace(atlas, graph=replace(atlas.graph, database=keyframes_but(atlas.graph.database, is_repeated)))
     found = renumbered(atlas, [int(place[row]) for row in [*range(first), *(first + one for one in kept)]], sum(stays))
-    old, database = atlas.graph.database.keyframes, found.graph.database
-    rows = [row for row, one in enumerate(old) if stays[one.frame]]
-    database = replace(
-        database, keyframes=tuple(database.keyframes[row] for row in rows), vectors=database.vectors[rows]
-    )
     nodes = tuple(node for node, ok in zip(found.graph.nodes, stays, strict=True) if ok)
     between = {name: [one for one in getattr(found.graph, name) if one.a != one.b] for name in MEASURED}
-    return replace(found, graph=replace(found.graph, nodes=nodes, database=database, **between))
+    return replace(found, graph=replace(found.graph, nodes=nodes, **between))
+
+
+def keyframes_but(database: Database, nodes: Collection[int]) -> Database:
+    """Remove the keyframes of some nodes."""
+    rows = [row for row, one in enumerate(database.keyframes) if one.frame not in nodes]
+    return replace(database, keyframes=tuple(database.keyframes[row] for row in rows), vectors=database.vectors[rows])
 
 
 def renumbered(atlas: Atlas, rows: Sequence[int], count: int) -> Atlas:

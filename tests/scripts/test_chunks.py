@@ -87,7 +87,7 @@ def test_all_chunks_that_are_missing_are_named_if_too_few_are_left(tmp_path, mon
 
 
 WALK = (*SMOKE, "dataset.num_frames=80", "dataset.stop=24", "prior.level=0", "graph=default")
-CHUNKS = ("chunks=3", "overlap=4")  # frames 0 to 10, 7 to 17, 13 to 23
+CHUNKS = ("chunks=3", "overlap=4")  # frames 0 to 9, 6 to 16, 13 to 23
 
 
 def times_of(folder: Path) -> dict[str, int]:
