@@ -18,6 +18,7 @@ from emgs_jax.runs.metrics import score_back_end
 
 pytestmark = [pytest.mark.slow, pytest.mark.xdist_group("smoke")]
 MAX_DISTANCE, MAX_TURN = 0.05, 2.0  # the bar, where the prior errs; here it is exact
+MAX_ADDED = 0.02  # rad, by which it and the map may differ
 
 
 def assert_near(records) -> None:
@@ -51,9 +52,10 @@ def test_a_camera_that_was_carried_off_comes_back():
     chain = [edge for edge in end.factors if edge.a == edge.b + 1 and edge.sqrt_info[6, 6]]  # none by the map
     assert {end.nodes[edge.a].is_placed for edge in chain} == {True, False}
     for edge in chain:
-        record = run.records[edge.a]
-        told = max(record.depth_noise, LEAST_NOISE) if end.nodes[edge.a].is_placed else noise.depth
-        assert edge.sqrt_info[5, 5] == pytest.approx(1 / (told * noise.pair)), "of a lost frame few points fit exactly"
+        record, is_placed = run.records[edge.a], end.nodes[edge.a].is_placed
+        told = max(record.depth_noise, LEAST_NOISE) if is_placed else noise.depth
+        # What the exact prior and the map differ by is added; of a lost frame few points fit exactly.
+        assert 0.9999 <= 1 / (edge.sqrt_info[5, 5] * told * noise.pair) <= 1.0001 + is_placed * MAX_ADDED / told
 
 
 NOWHERE = (NEVER_FOUND, "graph.min_violation=1e9", "graph.relocalization.max_patience=4")
@@ -147,7 +149,10 @@ def test_a_run_goes_on_in_a_saved_map_and_can_be_saved_itself(folder, tmp_path):
     for edge in new:
         told = max(run.records[edge.a - end.first_node].depth_noise, LEAST_NOISE)
         angle = noise.pair if edge.sqrt_info[6, 6] else noise.map
-        assert edge.sqrt_info[5, 5] == pytest.approx(1 / (told * angle)), "as sure as its frame's depths"
+        known = end.nodes[edge.b].predicted is not None
+        assert 0.9999 <= 1 / (edge.sqrt_info[5, 5] * told * angle) <= 1.0001 + known * MAX_ADDED / told, (
+            "as sure as its frame's depths, and as the prior and the map agree"
+        )
     save_progress(tmp_path, run)
     (tmp_path / "metrics.json").write_text("{}")
     again = loaded(tmp_path, "extend")
