@@ -97,7 +97,11 @@ def times_of(folder: Path) -> dict[str, int]:
 @pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["basic", pytest.param("joblib", marks=pytest.mark.weekly)])
 def test_what_is_missing_is_named_and_made_by_the_same_command_again_and_the_rest_is_joined(tmp_path, launcher):
-    """The last chunk cannot be written at first. The prior is exact, so the joined path is the true one."""
+    """The last chunk cannot be written at first. The prior is exact, so the joined path is the true one.
+
+    It predicts in the world of the truth, in which the chunks fit each other as they are: where a join places a map in
+    another world and unit is tested in runs/test_shared_frames.py and mapping/test_merging.py.
+    """
     if launcher != "basic":
         pytest.importorskip(f"hydra_plugins.hydra_{launcher}_launcher")
     folder = tmp_path / "walk"
