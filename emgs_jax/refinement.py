@@ -18,6 +18,8 @@ from emgs_jax.ops.pytree import choice, static, take_rows, traced, where_rows
 from emgs_jax.render.composite import RenderConfig, Rendering, render_splats, splat_depth, splats_of
 from emgs_jax.render.project import Splats
 
+SQUARES = 1.6  # times the standard deviation of a square; with it 518×392 images, thinned by 2, allow 3 pixels
+
 
 class RefinementConfig(eqx.Module):
     """Association on the image plane.
@@ -157,10 +159,20 @@ def average_candidates(
     return where_rows(sums > 0, averaged, old)
 
 
-def without_scattered(candidates: Gaussians, splats: Splats, config: RefinementConfig) -> Gaussians:
-    """Invalidate candidates whose splats are wider than `max_splat_std`, as those of scattered points are."""
-    widest = jnp.sqrt(jnp.trace(splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale)
-    return eqx.tree_at(lambda g: g.valid, candidates, candidates.valid & ~(widest > config.max_splat_std))
+def without_scattered(
+    first: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, min_std: Float[Array, ""], config: RefinementConfig
+) -> Gaussians:
+    """Invalidate the Gaussians of a first frame that are wider than `max_splat_std`, as scattered points are.
+
+    They are as many as cover the image, with n pixels each. A square of n pixels has a standard deviation of √(n / 6)
+    over both axes, so `SQUARES` times that is allowed where it is more. The floor of the covariances does not count.
+    """
+    splats = splats_of(first, T_world_camera, camera, config.render)
+    square = math.sqrt(camera.width * camera.height / (6 * first.valid.shape[0]))
+    limit = jnp.maximum(config.max_splat_std, SQUARES * square)
+    floor = camera.focal[0] * min_std / splats.depth
+    spread_sq = jnp.trace(splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale - 2.0 * floor**2
+    return eqx.tree_at(lambda g: g.valid, first, first.valid & ~(spread_sq > limit**2))
 
 
 @full_precision
@@ -190,7 +202,9 @@ def refine(
     map_splats, candidate_splats = (splats_of(g, T_world_camera, camera, config.render) for g in (old, candidates))
     rendering = render_splats(map_splats, old.colors, camera, config.render)
 
-    candidates = without_scattered(candidates, candidate_splats, config)
+    widest = jnp.sqrt(jnp.trace(candidate_splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale)
+    is_surface = candidates.valid & (widest <= config.max_splat_std)
+    candidates = eqx.tree_at(lambda g: g.valid, candidates, is_surface)
     map_depth = depth_at(rendering, candidate_splats, camera)
     # Match only visible Gaussians: one behind the rendered surface is occluded.
     own_depth = depth_at(rendering, map_splats, camera)

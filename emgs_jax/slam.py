@@ -54,7 +54,6 @@ from emgs_jax.refinement import RefinementConfig, RefinementInfo, refine, withou
 from emgs_jax.registration.depth_field import moved_by_field
 from emgs_jax.registration.pose_estimate import PoseEstimate, exact_estimate
 from emgs_jax.registration.rigid import median, pose_row
-from emgs_jax.render.composite import splats_of
 from emgs_jax.splitting import SplittingConfig, split
 from emgs_jax.surface_extrapolation import ExtrapolationConfig, extrapolate
 
@@ -281,14 +280,14 @@ def _first_state(
     view: Camera,
     config: SlamConfig,
 ) -> tuple[SlamState, Int[Array, ""]]:
-    splats = splats_of(gaussians, pose_row(sound_poses(T_world_views), -1), view, config.refinement.render)
-    gaussians = without_scattered(gaussians, splats, config.refinement)
+    pose = pose_row(sound_poses(T_world_views), -1)
+    gaussians = without_scattered(gaussians, pose, view, config.fit.min_std, config.refinement)
     # The second frame has nothing else to align with, so the first window confirms itself.
     existence = jnp.maximum(config.existence.birth, config.existence.hit)
     time = jnp.asarray(world.valid.shape[0], jnp.int32)
     new = new_map(gaussians, _first_weight(weight, config.em.average), existence, time - 1)
     map, _, overflow = insert(empty_map(config.submap.map_capacity, world.features.shape[-1]), new)
-    last, pose, looks = jax.tree.map(lambda leaf: leaf[-1], world), pose_row(sound_poses(T_world_views), -1), None
+    last, looks = jax.tree.map(lambda leaf: leaf[-1], world), None
     if (before := no_looks(last, config.motion)) is not None:
         still = jnp.zeros(last.valid.shape, bool)
         looks = look_again(before, last, still, pose, time - 1, view)

@@ -8,7 +8,8 @@ from scipy.spatial import cKDTree
 
 from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.gaussians import Gaussians
-from emgs_jax.refinement import match_on_image, refine
+from emgs_jax.ops.camera import Camera
+from emgs_jax.refinement import match_on_image, refine, without_scattered
 from emgs_jax.render.project import Splats
 
 refined, matched = map(sc.on_host, (refine, match_on_image))
@@ -181,3 +182,24 @@ def test_candidates_however_few_and_scattered_are_matched_with_the_splats_that_a
     assert found[:count].all() and np.mean(rows[:count] == expected) > 0.99  # the farthest may be another
     np.testing.assert_array_equal(rows[:count, 0], expected[:, 0])
     np.testing.assert_allclose(distance_sq[:count, 0], distances[:, 0] ** 2 / 32, rtol=1e-3, atol=1e-4)  # in float32
+
+
+@pytest.mark.parametrize(
+    ("std", "floor", "count", "stays"),
+    [
+        (0.05, 0.0, 100, True),  # 1.9 pixels along each axis, 2.7 over both: 3 are allowed
+        (0.15, 0.0, 100, False),  # 8 pixels of an image that a hundred cover
+        (0.15, 0.0, 4, True),  # an image that four cover: each is a quarter of it
+        (0.15, 0.149, 100, True),  # nothing but the floor of the covariances
+    ],
+)
+def test_a_first_frame_has_no_gaussians_of_scattered_points(std, floor, count, stays, config):
+    """Symptom: five of six splats wider than 10 cm were of the first frame, whose candidates nothing had tested."""
+    camera = Camera(np.float32([75.0, 75.0]), np.float32([19.5, 14.5]), 40, 30)
+    means = np.random.default_rng(0).uniform(-0.2, 0.2, (count, 3)) + [0, 0, 2.0]
+    first = sc.flat_gaussians(means, std, thickness=max(floor, 0.01))
+    settings = config().refinement
+    kept = sc.on_host(without_scattered)(first, CAMERA_POSE, camera, sc.device(floor), settings)
+    np.testing.assert_array_equal(kept.valid, stays)
+    printed = config("slam/refinement=paper").refinement
+    assert sc.on_host(without_scattered)(first, CAMERA_POSE, camera, sc.device(floor), printed).valid.all()

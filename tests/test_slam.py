@@ -53,8 +53,9 @@ def test_the_first_state_holds_the_last_view_as_it_is_in_the_world(state, window
     np.testing.assert_allclose(state.previous.points, expected.points, atol=1e-6)  # roundings
     assert max(sc.pose_error(state.T_world_previous, sc.path_pose(FRAME - 1))) < 1e-6
     valid = np.asarray(state.map.gaussians.valid)
-    assert valid.sum() == 3 * 768 // (8 * 3)
-    np.testing.assert_allclose(np.asarray(state.map.weight)[valid].sum(), 3 * 768 / 8, rtol=1e-5)  # of λ points
+    assert 0.95 * 96 < valid.sum() <= 96 == 3 * 768 // (8 * 3)  # some are of scattered points
+    weights = np.asarray(state.map.weight)[valid]
+    np.testing.assert_allclose(weights.sum(), 3 * 768 / 8, rtol=0.05)  # of λ points
     assert state.time == FRAME and (np.asarray(state.map.birth)[valid] == FRAME - 1).all()
 
 
