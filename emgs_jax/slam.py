@@ -114,7 +114,7 @@ class SlamConfig(eqx.Module):
             stds = (stage.min_std for stage in (config.fit, config.em, config.splitting))
             return *stds, config.submap.voxel_size, config.submap.margin
 
-        return eqx.tree_at(lengths, self, replace_fn=lambda length: metre * length)
+        return self if metre == 1 else eqx.tree_at(lengths, self, replace_fn=lambda length: metre * length)
 
     @property
     def fusion(self) -> "FusionConfig":

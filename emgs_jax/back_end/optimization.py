@@ -15,6 +15,7 @@ from emgs_jax.back_end.factors import loop_factor, measured_again, stack_factors
 from emgs_jax.back_end.state import BackEnd, Closure, Node
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.existence import ExistenceConfig, merge_all_duplicates
+from emgs_jax.gaussian_map import GaussianMap
 from emgs_jax.layers import fuse_sheets, one_layer
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.ops.precision import full_precision
@@ -28,7 +29,7 @@ from emgs_jax.registration.rigid import scale_translation
 from emgs_jax.slam import SlamState
 
 move_map, _move_view = eqx.filter_jit(deform), eqx.filter_jit(deform_view)  # compiled once per size of the map
-_merge, _one_layer, _fuse_sheets = (eqx.filter_jit(f) for f in (merge_all_duplicates, one_layer, fuse_sheets))
+_merge, _one_layer = eqx.filter_jit(merge_all_duplicates), eqx.filter_jit(one_layer)
 
 
 @full_precision
@@ -117,7 +118,19 @@ def merge_duplicates_of_state(state: SlamState, end: BackEnd, config: ExistenceC
 def fuse_sheets_of_state(state: SlamState, end: BackEnd, config: ExistenceConfig) -> SlamState:
     """Fuse the sheets of the surfaces of a whole map, see `fuse_sheets`."""
     noise = depth_noise_of(end)
-    return state if noise is None else replace(state, map=_fuse_sheets(state.map, _origins(end, state), noise, config))
+    if noise is None:
+        return state
+    centers = np.zeros((bucket(len(end.nodes)), 3), np.float32)
+    centers[: len(end.nodes)] = np.stack(end.poses)[:, :3, 3]
+    return replace(state, map=_fuse_sheets(state.map, jnp.asarray(centers), noise, config))
+
+
+@eqx.filter_jit
+def _fuse_sheets(
+    map: GaussianMap, centers: Float[Array, "k 3"], depth_noise: Float[Array, ""], config: ExistenceConfig
+) -> GaussianMap:
+    """Do `fuse_sheets` with the centres of all nodes; one program, for every run ends with it."""
+    return fuse_sheets(map, take_rows(centers, map.birth), depth_noise, config)
 
 
 def one_layer_of_state(state: SlamState, end: BackEnd, is_other: Sequence[bool], config: ExistenceConfig) -> SlamState:

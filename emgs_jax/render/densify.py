@@ -47,7 +47,7 @@ class DensifyConfig(eqx.Module):
 
     def in_unit(self, metre: float) -> "DensifyConfig":
         """Return the config with its lengths in a unit in which one of their metres is `metre` long."""
-        return eqx.tree_at(lambda config: config.min_std, self, metre * self.min_std)
+        return self if metre == 1 else eqx.tree_at(lambda config: config.min_std, self, metre * self.min_std)
 
 
 class DenseView(eqx.Module):

@@ -68,11 +68,11 @@ def test_a_run_makes_no_more_executables_than_it_did(runs):
     """33 when this was written: two thirds are kept functions, the rest an operation that the host asks for each.
 
     Two more fill the covariances of a prior that does not say how sure it is of its poses, and two find what moves and
-    keep the frame to look for that in the next.
+    keep the frame to look for that in the next. One fuses the sheets of surfaces when the run ends.
 
     A further one costs .05 to .5 s of every first run, so who adds some says why here.
     """
-    assert runs.cold.events["compile_requests_use_cache"] <= 38
+    assert runs.cold.events["compile_requests_use_cache"] <= 39
 
 
 def test_nothing_is_compiled_twice(runs):
