@@ -35,7 +35,7 @@ class RefinementConfig(eqx.Module):
         min_normal_cos: pairs whose normals differ more do not merge; `-inf` as printed.
         cosine_weight: share of the features' cosine in ω: 1 as printed; 0: features do not count.
         max_splat_std: pixels of the rendered image; a wider candidate is scattered points, not a surface, and is
-            dropped; `inf` as printed.
+            dropped, unless all are as wide, see `_limit`; `inf` as printed.
     """
 
     num_candidates: int = static(low=1, high=256)
@@ -159,17 +159,26 @@ def average_candidates(
     return where_rows(sums > 0, averaged, old)
 
 
+def _limit(count: int, camera: Camera, config: RefinementConfig) -> Float[Array, ""]:
+    """Compute the widest splat, in pixels, of `count` Gaussians that cover an image with n pixels each.
+
+    A square of n pixels has a standard deviation of √(n / 6) over both axes, so `SQUARES` times that is allowed where
+    it is more than `max_splat_std`, as in large images.
+    """
+    return jnp.maximum(config.max_splat_std, SQUARES * math.sqrt(camera.width * camera.height / (6 * count)))
+
+
 def without_scattered(
     first: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, min_std: Float[Array, ""], config: RefinementConfig
 ) -> Gaussians:
     """Invalidate the Gaussians of a first frame that are wider than `max_splat_std`, as scattered points are.
 
-    They are as many as cover the image, with n pixels each. A square of n pixels has a standard deviation of √(n / 6)
-    over both axes, so `SQUARES` times that is allowed where it is more. The floor of the covariances does not count.
+    The floor of the covariances does not count.
     """
-    splats = splats_of(first, T_world_camera, camera, config.render)
-    square = math.sqrt(camera.width * camera.height / (6 * first.valid.shape[0]))
-    limit = jnp.maximum(config.max_splat_std, SQUARES * square)
+    splats, limit = (
+        splats_of(first, T_world_camera, camera, config.render),
+        _limit(first.valid.shape[0], camera, config),
+    )
     floor = camera.focal[0] * min_std / splats.depth
     spread_sq = jnp.trace(splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale - 2.0 * floor**2
     return eqx.tree_at(lambda g: g.valid, first, first.valid & ~(spread_sq > limit**2))
@@ -203,7 +212,7 @@ def refine(
     rendering = render_splats(map_splats, old.colors, camera, config.render)
 
     widest = jnp.sqrt(jnp.trace(candidate_splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale)
-    is_surface = candidates.valid & (widest <= config.max_splat_std)
+    is_surface = candidates.valid & (widest <= _limit(candidates.valid.shape[0], camera, config))
     candidates = eqx.tree_at(lambda g: g.valid, candidates, is_surface)
     map_depth = depth_at(rendering, candidate_splats, camera)
     # Match only visible Gaussians: one behind the rendered surface is occluded.

@@ -203,3 +203,14 @@ def test_a_first_frame_has_no_gaussians_of_scattered_points(std, floor, count, s
     np.testing.assert_array_equal(kept.valid, stays)
     printed = config("slam/refinement=paper").refinement
     assert sc.on_host(without_scattered)(first, CAMERA_POSE, camera, sc.device(floor), printed).valid.all()
+
+
+@pytest.mark.parametrize(("count", "stays"), [(100, False), (4, True)])
+def test_candidates_are_as_wide_as_the_pixels_of_each(count, stays, config):
+    """Symptom: in images of 1036x784 patches are wider than 3 pixels, and nothing that came into view was mapped."""
+    camera = Camera(np.float32([75.0, 75.0]), np.float32([19.5, 14.5]), 40, 30)
+    means = np.random.default_rng(0).uniform(-0.2, 0.2, (count, 3)) + [0, 0, 2.0]
+    nothing = sc.flat_gaussians(np.zeros((8, 3)), 0.15)
+    submap = sc.fresh_map(sc.replace(nothing, valid=np.zeros(8, bool)))
+    _, fresh, info = refined(submap, sc.flat_gaussians(means, 0.15), CAMERA_POSE, camera, config().refinement)
+    assert (np.asarray(fresh.valid) == stays).all() and info.num_fresh == stays * count
