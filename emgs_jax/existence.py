@@ -191,7 +191,7 @@ def _sight(
     nearest, farthest = depths[:, index]
     variance = quadratic(lower_entries(gaussians.covs), jnp.unstack(gaussians.normals, axis=-1))
     reach = config.num_std * jnp.sqrt((depth_noise * depth) ** 2 + variance)
-    is_steep = jnp.abs(_inner(gaussians.normals, rays)) >= config.min_cos * jnp.linalg.norm(rays, axis=-1)
+    is_steep = jnp.abs(inner(gaussians.normals, rays)) >= config.min_cos * jnp.linalg.norm(rays, axis=-1)
     is_looked_at = gaussians.valid & inside & (depth > NEAREST_DEPTH) & is_steep
     is_seen = is_looked_at & (jnp.minimum(jnp.abs(depth - nearest), jnp.abs(depth - farthest)) <= reach)
     is_seen_through = is_looked_at & (depth < nearest - reach)
@@ -292,7 +292,7 @@ def nearest_layer(
     groups = group_points(gaussians.means, is_known)
     order = order_of(group_points(gaussians.means, is_asked), count)
     rows, found = nearest(gaussians.means, is_asked, gaussians.means, groups, config.num_neighbours, order=order)
-    noise = depth_noise * jnp.abs(_inner(gaussians.normals, gaussians.means - origins))
+    noise = depth_noise * jnp.abs(inner(gaussians.normals, gaussians.means - origins))
     covs, normals = lower_entries(gaussians.covs), jnp.unstack(gaussians.normals, axis=-1)
     frames = jnp.maximum(map.weight, 1.0)
 
@@ -313,7 +313,7 @@ def nearest_layer(
         is_alike = dot(near_normals, normals) >= config.min_normal_cos
         near_features = gaussians.features[rows]
         has_both = has_feature(near_features) & has_feature(gaussians.features)
-        is_alike &= ~has_both | (_inner(near_features, gaussians.features) > 0)
+        is_alike &= ~has_both | (inner(near_features, gaussians.features) > 0)
         is_layer = found & is_asked & (rows != jnp.arange(count)) & is_one & is_alike
         return jnp.where(is_layer, distance_sq, jnp.inf)
 
@@ -325,8 +325,9 @@ def nearest_layer(
 
 def along_surface(offsets: Float[Array, "*b 3"], normals: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     """Project each offset onto the plane orthogonal to its normal."""
-    return offsets - _inner(offsets, normals)[..., None] * normals
+    return offsets - inner(offsets, normals)[..., None] * normals
 
 
-def _inner(first: Float[Array, "*b d"], second: Float[Array, "*#b d"]) -> Float[Array, "*b"]:
+def inner(first: Float[Array, "*b d"], second: Float[Array, "*#b d"]) -> Float[Array, "*b"]:
+    """Compute the inner product of each pair of vectors."""
     return jnp.sum(first * second, axis=-1)

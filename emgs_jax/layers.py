@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.existence import MIN_GAP, ExistenceConfig, along_surface, nearest_layer
+from emgs_jax.existence import MIN_GAP, ExistenceConfig, along_surface, inner, nearest_layer
 from emgs_jax.gaussian_map import GaussianMap, without
 from emgs_jax.gaussians import Gaussians, has_feature
 from emgs_jax.ops.linalg import lower_entries, outer, quadratic, safe_normalize, whiten, whitened_entries
@@ -169,23 +169,23 @@ def _nearest_sheet(
         """Measure the squared distance to one neighbour of each; infinite if that is no sheet of its surface."""
         near, found = one
         normal = safe_normalize(gaussians.normals + gaussians.normals[near])
-        gap = _inner(normal, gaussians.means[near] - gaussians.means)
+        gap = inner(normal, gaussians.means[near] - gaussians.means)
         thickness = [quadratic(lower_entries(gaussians.covs[i]), jnp.unstack(normal, axis=-1)) for i in (own, near)]
-        noise = [depth_noise * _inner(normal, gaussians.means[i] - origins[i]) for i in (own, near)]
+        noise = [depth_noise * inner(normal, gaussians.means[i] - origins[i]) for i in (own, near)]
         is_behind = gap**2 > MIN_GAP**2 * jnp.maximum(*thickness)
         apart_sq = gap**2 / (noise[0] ** 2 + noise[1] ** 2)
 
         front, behind = jnp.where(gap > 0, near, own), jnp.where(gap > 0, own, near)
         ray = gaussians.means[behind] - origins[behind]
-        reach = _inner(normal, gaussians.means[front] - origins[behind]) / _inner(normal, ray)
+        reach = inner(normal, gaussians.means[front] - origins[behind]) / inner(normal, ray)
         crossing = origins[behind] + reach[:, None] * ray - gaussians.means[front]
         white = whiten(tuple(entry[front] for entry in triangles), jnp.unstack(crossing, axis=-1))
         crossing_sq = sum(entry**2 for entry in white)
         is_seen_through = (crossing_sq <= MAX_CROSSING_SQ) & (reach > 0) & (reach < 1)
 
-        is_alike = _inner(gaussians.normals, gaussians.normals[near]) >= config.min_normal_cos
+        is_alike = inner(gaussians.normals, gaussians.normals[near]) >= config.min_normal_cos
         features = gaussians.features, gaussians.features[near]
-        is_alike &= ~(has_feature(features[0]) & has_feature(features[1])) | (_inner(*features) > 0)
+        is_alike &= ~(has_feature(features[0]) & has_feature(features[1])) | (inner(*features) > 0)
         is_lighter = (map.weight < map.weight[near]) | ((map.weight == map.weight[near]) & (own < near))
         is_sheet = found & gaussians.valid & (near != own) & is_lighter & is_alike & is_behind & is_seen_through
         return jnp.where(is_sheet & (apart_sq <= MAX_APART_SQ), apart_sq + crossing_sq, jnp.inf)
@@ -193,7 +193,3 @@ def _nearest_sheet(
     distance_sq = jax.lax.map(distance_to, (rows.T, found.T))
     sheet = jnp.take_along_axis(rows, jnp.argmin(distance_sq, axis=0)[:, None], axis=1)[:, 0]
     return sheet, jnp.min(distance_sq, axis=0) < jnp.inf
-
-
-def _inner(first: Float[Array, "*b d"], second: Float[Array, "*b d"]) -> Float[Array, "*b"]:
-    return jnp.sum(first * second, axis=-1)

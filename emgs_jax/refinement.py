@@ -175,10 +175,8 @@ def without_scattered(
 
     The floor of the covariances does not count.
     """
-    splats, limit = (
-        splats_of(first, T_world_camera, camera, config.render),
-        _limit(first.valid.shape[0], camera, config),
-    )
+    splats = splats_of(first, T_world_camera, camera, config.render)
+    limit = _limit(first.valid.shape[0], camera, config)
     floor = camera.focal[0] * min_std / splats.depth
     spread_sq = jnp.trace(splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale - 2.0 * floor**2
     return eqx.tree_at(lambda g: g.valid, first, first.valid & ~(spread_sq > limit**2))
