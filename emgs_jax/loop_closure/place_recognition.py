@@ -6,8 +6,8 @@ with the keyframes just before the query, never with an absolute threshold.
 """
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -254,3 +254,9 @@ def _apart(
         if is_allowed[row] and all(apart) and len(chosen) < count:
             chosen.append(int(row))
     return chosen
+
+
+def keyframes_but(database: Database, nodes: Collection[int]) -> Database:
+    """Remove the keyframes of some nodes."""
+    rows = [row for row, one in enumerate(database.keyframes) if one.frame not in nodes]
+    return replace(database, keyframes=tuple(database.keyframes[row] for row in rows), vectors=database.vectors[rows])

@@ -19,6 +19,7 @@ from emgs_jax.back_end.saved_map import SavedMap
 from emgs_jax.back_end.state import BackEnd, Node, transform_nodes
 from emgs_jax.gaussian_map import grow
 from emgs_jax.geometry import Sim3, scale_covariance, scale_pose
+from emgs_jax.loop_closure.place_recognition import keyframes_but
 from emgs_jax.loop_closure.relocalization import RelocalizedPose
 from emgs_jax.mapping.capacity import add_map
 from emgs_jax.motion import no_looks
@@ -168,7 +169,7 @@ def set_unjoined_apart(atlas: Atlas, kept: int | None = None) -> Atlas:
     """
     if len(atlas.submaps) < 2:
         return atlas
-    graph, known = atlas.graph, atlas.graph.database
+    graph = atlas.graph
     if kept is None:
         counts = Counter(node.submap for node in graph.nodes if node.is_placed)
         kept = 0 if graph.first_node else max(sorted(counts), key=lambda one: counts[one])
@@ -177,12 +178,10 @@ def set_unjoined_apart(atlas: Atlas, kept: int | None = None) -> Atlas:
         name: [one for one in getattr(graph, name) if is_kept[one.a] and is_kept[one.b]]
         for name in ("factors", "verified", "violating", "accepted")
     }
-    rows = [row for row, one in enumerate(known.keyframes) if is_kept[one.frame]]
-    keyframes = tuple(known.keyframes[row] for row in rows)
 
     def apart(node: Node) -> Node:
         return replace(node, is_placed=False, covariance=node.covariance if node.is_placed else None)
 
     nodes = tuple(node if here else apart(node) for node, here in zip(graph.nodes, is_kept, strict=True))
-    database = replace(known, keyframes=keyframes, vectors=known.vectors[rows])
+    database = keyframes_but(graph.database, {row for row, here in enumerate(is_kept) if not here})
     return replace(atlas, graph=replace(graph, nodes=nodes, active=kept, database=database, **between))

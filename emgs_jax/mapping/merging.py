@@ -6,7 +6,7 @@ these say where the other map is.
 """
 
 from collections import Counter
-from collections.abc import Collection, Sequence
+from collections.abc import Sequence
 from dataclasses import is_dataclass, replace
 from typing import Any
 
@@ -21,7 +21,7 @@ from emgs_jax.back_end.saved_map import LEFT_OUT
 from emgs_jax.back_end.state import BackEnd, Node, transform_nodes
 from emgs_jax.gaussian_map import transformed
 from emgs_jax.geometry import Sim3, scale_pose
-from emgs_jax.loop_closure.place_recognition import Database, train_database
+from emgs_jax.loop_closure.place_recognition import keyframes_but, train_database
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.mapping.atlas import Atlas, Submap, with_state
 from emgs_jax.mapping.capacity import add_map
@@ -117,12 +117,6 @@ def without_repeats(atlas: Atlas, kept: Sequence[int]) -> Atlas:
     nodes = tuple(node for node, ok in zip(found.graph.nodes, stays, strict=True) if ok)
     between = {name: [one for one in getattr(found.graph, name) if one.a != one.b] for name in MEASURED}
     return replace(found, graph=replace(found.graph, nodes=nodes, **between))
-
-
-def keyframes_but(database: Database, nodes: Collection[int]) -> Database:
-    """Remove the keyframes of some nodes."""
-    rows = [row for row, one in enumerate(database.keyframes) if one.frame not in nodes]
-    return replace(database, keyframes=tuple(database.keyframes[row] for row in rows), vectors=database.vectors[rows])
 
 
 def renumbered(atlas: Atlas, rows: Sequence[int], count: int) -> Atlas:
