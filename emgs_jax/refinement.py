@@ -34,8 +34,8 @@ class RefinementConfig(eqx.Module):
             each Gaussian's plane (`pairs`), so that no pair joins two sides of a depth edge.
         min_normal_cos: pairs whose normals differ more do not merge; `-inf` as printed.
         cosine_weight: share of the features' cosine in ω: 1 as printed; 0: features do not count.
-        max_splat_std: pixels of the rendered image; a wider candidate is scattered points, not a surface, and is
-            dropped, unless all are as wide, see `_limit`; `inf` as printed.
+        max_splat_std: pixels of the rendered image; a wider Gaussian of a frame is scattered points, not a surface, and
+            is dropped, unless all are as wide, see `without_scattered`; `inf` as printed.
     """
 
     num_candidates: int = static(low=1, high=256)
@@ -159,27 +159,25 @@ def average_candidates(
     return where_rows(sums > 0, averaged, old)
 
 
-def _limit(count: int, camera: Camera, config: RefinementConfig) -> Float[Array, ""]:
-    """Compute the widest splat, in pixels, of `count` Gaussians that cover an image with n pixels each.
-
-    A square of n pixels has a standard deviation of √(n / 6) over both axes, so `SQUARES` times that is allowed where
-    it is more than `max_splat_std`, as in large images.
-    """
-    return jnp.maximum(config.max_splat_std, SQUARES * math.sqrt(camera.width * camera.height / (6 * count)))
-
-
 def without_scattered(
-    first: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, min_std: Float[Array, ""], config: RefinementConfig
+    new: Gaussians, T_world_camera: jaxlie.SE3, camera: Camera, min_std: Float[Array, ""], config: RefinementConfig
 ) -> Gaussians:
-    """Invalidate the Gaussians of a first frame that are wider than `max_splat_std`, as scattered points are.
+    """Invalidate the new Gaussians of a frame whose splats are wider than `max_splat_std`, as scattered points are.
 
-    The floor of the covariances does not count.
+    `count` Gaussians cover an image with n pixels each, and a square of n pixels has a standard deviation of √(n / 6)
+    over both axes. `SQUARES` times that is allowed where it is more, as in large images. The floor of covariances,
+    `min_std`, does not count: near the camera it alone is wider.
+
+    Args:
+        new: Gaussians of one frame, world frame; their rows are as many as an image has.
+        camera: of the images that are rendered.
     """
-    splats = splats_of(first, T_world_camera, camera, config.render)
-    limit = _limit(first.valid.shape[0], camera, config)
+    splats = splats_of(new, T_world_camera, camera, config.render)
+    square = math.sqrt(camera.width * camera.height / (6 * new.valid.shape[0]))
+    limit = jnp.maximum(config.max_splat_std, SQUARES * square)
     floor = camera.focal[0] * min_std / splats.depth
     spread_sq = jnp.trace(splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale - 2.0 * floor**2
-    return eqx.tree_at(lambda g: g.valid, first, first.valid & ~(spread_sq > limit**2))
+    return eqx.tree_at(lambda g: g.valid, new, new.valid & ~(spread_sq > limit**2))
 
 
 @full_precision
@@ -209,9 +207,6 @@ def refine(
     map_splats, candidate_splats = (splats_of(g, T_world_camera, camera, config.render) for g in (old, candidates))
     rendering = render_splats(map_splats, old.colors, camera, config.render)
 
-    widest = jnp.sqrt(jnp.trace(candidate_splats.covs, axis1=-2, axis2=-1) / config.render.covariance_scale)
-    is_surface = candidates.valid & (widest <= _limit(candidates.valid.shape[0], camera, config))
-    candidates = eqx.tree_at(lambda g: g.valid, candidates, is_surface)
     map_depth = depth_at(rendering, candidate_splats, camera)
     # Match only visible Gaussians: one behind the rendered surface is occluded.
     own_depth = depth_at(rendering, map_splats, camera)

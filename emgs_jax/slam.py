@@ -316,7 +316,7 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     frame = _localize_fine(current, moving, submap, coarse, state.time, config.localization, stages)
     fused = _fuse(submap, frame, view, num_rows, config.fusion)
     candidates, weight = cluster(fused.unexplained, _order(view), num_rows, config.fit)
-    refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config.refinement, stages)
+    refined, fresh, refinement = _refine(fused.map, candidates, frame.T_world_camera, view, config)
     new = NewGaussians(fresh, weight, fused.halves)
     looks, seen = None, None
     if state.looks is not None:
@@ -463,10 +463,10 @@ def _refine(
     candidates: Gaussians,
     T_world_camera: jaxlie.SE3,
     view: Camera,
-    config: RefinementConfig,
-    stages: Stages,
+    config: SlamConfig,
 ) -> tuple[GaussianMap, Gaussians, RefinementInfo]:
-    return stages.refine(map, candidates, T_world_camera, view, config)
+    surfaces = without_scattered(candidates, T_world_camera, view, config.fit.min_std, config.refinement)
+    return config.stages.refine(map, surfaces, T_world_camera, view, config.refinement)
 
 
 @executable

@@ -334,11 +334,7 @@ def refine(g, weight, candidates, pose, camera, config):
         is_alike = g["normals"][k] @ candidates["normals"][j] >= config.min_normal_cos
         return is_alike and (config.depth_condition == 0 or is_within(z, plane))
 
-    square = np.sqrt(camera.width * camera.height / (6 * len(candidates["valid"])))  # of both axes
     for j, (pixel, cov_2d, (*_, z), _, d) in seen(candidates).items():
-        if np.sqrt(np.trace(cov_2d) / scale) > max(config.max_splat_std, 1.6 * square):
-            is_fresh[j] = False
-            continue
         if d == 0 or not is_within(z, d):
             continue
         nearest = sorted(visible, key=lambda k, at=pixel: np.linalg.norm(known[k][0] - at))[: config.num_candidates]
