@@ -66,9 +66,9 @@ def save_progress(folder: Path, run: MappingRun) -> None:
     """
     _complete_lines(folder / FRAMES_FILE, run)
     if run.state is not None:
-        placed = [row for row, record in enumerate(run.records) if record.status not in UNPLACED]
-        path = [run.records[row] for row in placed], [run.poses[row] for row in placed]
-        _save_path_and_map(folder, *path, run.state.map)
+        rows = zip(run.records, run.poses, strict=True)
+        placed = [(record, pose) for record, pose in rows if record.status not in UNPLACED]
+        _save_path_and_map(folder, [record for record, _ in placed], [pose for _, pose in placed], run.state.map)
     for number, state in run.apart.items():  # in its own world and unit
         submap, records = folder / "submaps" / str(number), records_apart(run.records, number)
         submap.mkdir(parents=True, exist_ok=True)
