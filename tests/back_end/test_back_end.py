@@ -25,7 +25,6 @@ from emgs_jax.back_end.factors import (
 from emgs_jax.back_end.loops import (
     consistent_loops,
     is_closure_due,
-    loop_chi2,
     not_in_graph,
     query_prior,
     remove_inconsistent,
@@ -136,7 +135,7 @@ def test_what_was_measured_without_error_moves_nothing(graph):
     end, closed = close_loops(end, state, [loop(poses)])
     assert error(end.poses, poses) < 1e-5 and end.closures[-1].info.reason == ""
     np.testing.assert_allclose(closed.map.gaussians.means, state.map.gaussians.means, atol=1e-5)
-    assert loop_chi2(end, loop(poses)) < 1e-3 and not is_closure_due(end, [loop(poses)])
+    assert chi2(loop(poses), end.poses, end.log_scales) < 1e-3 and not is_closure_due(end, [loop(poses)])
 
 
 def test_a_loop_brings_poses_map_and_last_frame_back(graph):
@@ -146,7 +145,7 @@ def test_a_loop_brings_poses_map_and_last_frame_back(graph):
     end = walked(graph, drifted)
     state = state_of(drifted)
     loops = [loop(truth, row) for row in range(1, 9)]
-    assert loop_chi2(end, loops[0]) > graph.min_violation and is_closure_due(end, loops)
+    assert chi2(loops[0], end.poses, end.log_scales) > graph.min_violation and is_closure_due(end, loops)
     before, gap = error(drifted, truth), lambda poses: np.linalg.norm(poses[1][:3, 3] - poses[-2][:3, 3])
     end, closed = close_loops(end, state, loops)
     assert end.accepted == loops and not is_closure_due(end, loops)
