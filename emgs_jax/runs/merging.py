@@ -145,7 +145,7 @@ def merged(runs: Sequence[MergeableRun], has_truth: bool) -> Merged:
     parts = joined_by_images([Part(run.atlas, [row], [*range(len(run.records))]) for row, run in enumerate(runs)], runs)
     first, pending, reasons = parts[0], parts[1:], {}
     while pending:
-        for row, part in enumerate(pending):
+        for part in pending:
             found = joined(first, part, runs)
             if isinstance(found, Part):
                 break
@@ -153,8 +153,8 @@ def merged(runs: Sequence[MergeableRun], has_truth: bool) -> Merged:
         else:
             break
         first = found
-        reasons = {number: why for number, why in reasons.items() if number not in pending[row].runs}
-        del pending[row]
+        reasons = {number: why for number, why in reasons.items() if number not in part.runs}
+        pending.remove(part)
     atlas, order, images = first.atlas, first.runs, first.images
     if len(order) == 1:
         why = "; ".join(f"{runs[number].finished.folder}: {reason}" for number, reason in reasons.items())
