@@ -1,6 +1,7 @@
 """Loops: detect them by keyframes, verify them, query the prior, and check spatial consistency."""
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -13,6 +14,7 @@ from emgs_jax.loop_closure.place_recognition import (
     make_keyframe,
     most_similar,
     propose_candidates,
+    propose_for_all,
 )
 from emgs_jax.loop_closure.prior_query import PriorQuery, fuse_measurements, measure_by_prior
 from emgs_jax.loop_closure.relocalization import NO_CANDIDATE, PosedKeyframes, RelocalizedPose, relocalize
@@ -40,18 +42,24 @@ def detect_loops_between(end: BackEnd, submap_id: int, is_one_walk: bool = False
     """Verify loops between the keyframes of a submap, whose unit may differ, and those of the active one.
 
     The submap's nodes come after those of the active one. If both are of one walk, these keyframes have the candidates
-    that they would have in one run.
+    that they would have in one run, and no more: those that were tested before count.
     """
     config, is_placed = end.config.place_recognition, [end.nodes[one.frame].is_placed for one in end.database.keyframes]
     known, queries = (
         [row for row, ok in enumerate(is_placed) if ok and _submap_id_of(end, row) == number]
         for number in (end.active, submap_id)
     )
-    for row in queries:
-        if is_one_walk:
-            candidates = [one for one in propose_candidates(end.database, row, config) if one in known]
-        else:
-            candidates = most_similar(end.database, end.database.keyframes[row], known, config.num_candidates, config)
+    if is_one_walk:
+        there, tested = {*known}, Counter(one.b for one in (*end.verified, *end.refusals))
+        left = (max(config.num_candidates - tested[end.database.keyframes[row].frame], 0) for row in queries)
+        proposed = (
+            [one for one in each if one in there][:most]
+            for each, most in zip(propose_for_all(end.database, queries, config), left, strict=True)
+        )
+    else:
+        asked = (end.database.keyframes[row] for row in queries)
+        proposed = (most_similar(end.database, one, known, config.num_candidates, config) for one in asked)
+    for row, candidates in zip(queries, proposed, strict=True):
         for candidate in candidates:
             end = _verify_candidate(end, row, candidate, is_free=True)
     return end
@@ -137,7 +145,9 @@ def _verify_candidate(end: BackEnd, row: int, other: int, is_free: bool = False)
     keyframes = end.database.keyframes
     candidate, rows = keyframes[other], (k for k in (other - 1, other + 1) if 0 <= k < row)
     beside = [keyframes[k] for k in rows if _submap_id_of(end, k) == end.active]
-    neighbours = neighbours_of(candidate, beside, end.poses, end.log_scales)
+    near = {one.frame: end.nodes[one.frame] for one in (candidate, *beside)}
+    poses, log_scales = ({row: getattr(node, name) for row, node in near.items()} for name in ("pose", "log_scale"))
+    neighbours = neighbours_of(candidate, beside, poses, log_scales)
     loop, info = verify(keyframes[row], candidate, neighbours, _verification_config(end, is_free))
     if info.violation is not None:
         end = replace(end, violating=[*end.violating, info.violation])
@@ -155,12 +165,8 @@ def is_closure_due(end: BackEnd, loops: Sequence[LoopMeasurement]) -> bool:
 
 def violated(end: BackEnd, loops: Sequence[LoopMeasurement]) -> list[LoopMeasurement]:
     """Select the loops that the current poses violate: χ² above `min_violation`."""
-    return [loop for loop in loops if loop_chi2(end, loop) > end.config.min_violation]
-
-
-def loop_chi2(end: BackEnd, loop: LoopMeasurement) -> float:
-    """Compute χ² of a loop at the current poses and scales."""
-    return chi2(loop, end.poses, end.log_scales)
+    poses, log_scales = end.poses, end.log_scales
+    return [loop for loop in loops if chi2(loop, poses, log_scales) > end.config.min_violation]
 
 
 def query_prior(end: BackEnd, loops: Sequence[LoopMeasurement], query: PriorQuery) -> BackEnd:

@@ -13,7 +13,7 @@ from emgs_jax.data.calibration_files import Calibration
 from emgs_jax.data.file_names import IMAGE_SUFFIXES, natural_key
 from emgs_jax.data.posed_images import Pose, PosedImages, Solved
 
-LAYOUT = "root/{sequences/00/{image_2/, calib.txt, times.txt}, poses/00.txt}"
+LAYOUT = "root/{sequences/00/{image_2/ or image_0/, calib.txt, times.txt}, poses/00.txt}"
 SOURCE = "KITTI odometry benchmark: colour images, calibration files and ground truth poses, project page at KIT"
 
 
@@ -26,7 +26,7 @@ class Kitti(PosedImages):
 
     sequence: str | int | None = None  # "00"; 7 means 07
     size: Sequence[int] = (480, 144)
-    camera: int = 2  # 0 and 1 are grey, 2 and 3 in colour, left and right
+    camera: int | None = None  # 0 and 1 are grey, 2 and 3 in colour, left and right; None: 2, or 0 without it
 
     name, layout, source = "kitti", LAYOUT, SOURCE
 
@@ -34,7 +34,10 @@ class Kitti(PosedImages):
         self.sequence = None if self.sequence is None else str(self.sequence).zfill(2)
         folder = self._find(self.sequence and f"sequences/{self.sequence}")
         truth = folder.parents[1] / "poses" / f"{self.sequence}.txt"
-        self._take(folder, read_kitti(folder, truth, self.camera))
+        camera = self.camera
+        if camera is None:  # the benchmark's downloads are grey or in colour
+            camera = next((one for one in (2, 0) if (folder / f"image_{one}").is_dir()), 2)
+        self._take(folder, read_kitti(folder, truth, camera))
 
 
 def read_kitti(folder: Path, truth: Path, camera: int) -> Solved:

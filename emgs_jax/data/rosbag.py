@@ -1,4 +1,4 @@
-"""Images of a bag of ROS 1 or 2, read without ROS by the package rosbags; no ground truth."""
+"""Images and inertial measurements of a bag of ROS 1 or 2, read without ROS by the package rosbags."""
 
 import re
 from collections.abc import Iterator, Sequence
@@ -9,7 +9,7 @@ from typing import Any
 
 import cv2
 import numpy as np
-from jaxtyping import UInt8
+from jaxtyping import Float, UInt8
 
 from emgs_jax.data import reading
 from emgs_jax.data.base import BadFrameError
@@ -19,7 +19,7 @@ from emgs_jax.data.straightened import Straightened
 from emgs_jax.data.tones import ALL_16_BITS, find_tones
 
 LAYOUT = "root[/sequence] = a .bag of ROS 1, or the folder of a ROS 2 bag with metadata.yaml"
-RAW, COMPRESSED, INFO = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo"))
+RAW, COMPRESSED, INFO, IMU = (f"sensor_msgs/msg/{name}" for name in ("Image", "CompressedImage", "CameraInfo", "Imu"))
 # Channels of an encoding, and OpenCV's conversion to RGB. Programs publish 8UC… when they name no encoding: then it is
 # OpenCV's order of colours.
 ENCODINGS = {"rgb8": (3, None), "bgr8": (3, cv2.COLOR_BGR2RGB), "8UC3": (3, cv2.COLOR_BGR2RGB)}
@@ -43,7 +43,7 @@ class RosBag(Straightened):
         self._path = self._find(self.sequence or ".")
         self._folder = self._path.parent
         with _opened(self._path) as bag:
-            self._topic = _topic_of(bag, (RAW, COMPRESSED), self.topic, self._path, "topic")
+            self._topic = _topic_of(bag, (RAW, COMPRESSED), self.topic, self._path, "dataset.topic=")
             received, stamps = _times(bag, self._topic)
             info = None if self.intrinsics is not None else _camera_info(bag, self._topic, self.info_topic, self._path)
         first: dict[int, int] = {}  # row of each time, which several messages may share
@@ -122,6 +122,33 @@ def when_taken(received: Sequence[int], stamps: Sequence[int]) -> tuple[list[int
     return [stamp if stamp > 0 else time - delay for time, stamp in zip(received, stamps, strict=True)], None
 
 
+def is_bag(path: Path) -> bool:
+    """Test whether a path is that of a bag of ROS 1, or of the folder of one of ROS 2."""
+    return path.is_dir() or path.suffix == ".bag"
+
+
+def read_imu(path: Path, topic: str | None) -> Float[np.ndarray, "m 7"]:
+    """Read time (s), rates (rad/s) and accelerations (m/s²) of a topic, in the order in which they were measured.
+
+    Args:
+        topic: of sensor_msgs/Imu; None: the only one.
+
+    Raises:
+        ValueError: there is no such bag or topic.
+    """
+    rows, received, stamps = [], [], []
+    with _opened(path) as bag:
+        topic = _topic_of(bag, (IMU,), topic, path, f"scale.imu={path}:TOPIC,")
+        for connection, time, raw in bag.messages(connections=_connections(bag, topic)):
+            message = bag.deserialize(raw, connection.msgtype)
+            stamp, vectors = message.header.stamp, (message.angular_velocity, message.linear_acceleration)
+            received.append(time)
+            stamps.append(stamp.sec * 10**9 + stamp.nanosec)
+            rows.append([value for vector in vectors for value in (vector.x, vector.y, vector.z)])
+    times, order = np.unique(when_taken(received, stamps)[0], return_index=True)  # a message may be recorded twice
+    return np.column_stack([times / 1e9, np.array(rows, np.float64).reshape(-1, 6)[order]])
+
+
 def to_rgb(message: Any, is_compressed: bool, label: str) -> np.ndarray:
     """The picture of a message, RGB (h, w, 3), 8 or 16 bits; BadFrameError if it is damaged or its encoding unknown."""
     encoding = str(message.format).partition(";")[0].strip() if is_compressed else str(message.encoding)
@@ -157,7 +184,7 @@ def _opened(path: Path) -> Iterator[Any]:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError as error:
-        raise ValueError('dataset=rosbag needs the library rosbags: pip install "emgs_jax[rosbag]"') from error
+        raise ValueError('a bag needs the library rosbags: pip install "emgs_jax[rosbag]"') from error
     try:
         with AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as bag:
             yield bag
@@ -183,7 +210,7 @@ def _topic_of(bag: Any, kinds: Sequence[str], topic: str | None, path: Path, key
     if not there:
         raise ValueError(f"{path} has no topic of sensor_msgs/{kind}")
     what = f"no topic {topic}" if topic else "several"
-    raise ValueError(f"{path} has {what} of sensor_msgs/{kind}: give dataset.{key}= one of {', '.join(there)}")
+    raise ValueError(f"{path} has {what} of sensor_msgs/{kind}: give {key} one of {', '.join(there)}")
 
 
 def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Calibration:
@@ -192,7 +219,7 @@ def _camera_info(bag: Any, topic: str, info_topic: str | None, path: Path) -> Ca
     if not kinds:
         raise ValueError(f"{path} has no camera_info, so dataset.intrinsics must say the camera: give {ALTERNATIVES}")
     wanted = beside if info_topic is None and beside in kinds else info_topic
-    chosen = _connections(bag, _topic_of(bag, (INFO,), wanted, path, "info_topic"))
+    chosen = _connections(bag, _topic_of(bag, (INFO,), wanted, path, "dataset.info_topic="))
     for connection, _, raw in bag.messages(connections=chosen):
         return calibration_of(bag.deserialize(raw, connection.msgtype), topic, str(path))
     raise ValueError(f"{path}: camera_info has no message, so dataset.intrinsics must say the camera: {ALTERNATIVES}")

@@ -19,6 +19,8 @@ from emgs_jax.geometry import pose_difference, scale_pose
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.ops.ranges import number
 
+QUERIES = 50  # of a chain, for which the allowed violations are counted
+
 
 @dataclass(frozen=True)
 class ConsistencyConfig:
@@ -28,7 +30,9 @@ class ConsistencyConfig:
         max_query_gap, max_candidate_gap: between the queries and between the candidates of two loops.
         max_distance: between the positions that two loops imply for one query.
         min_others: consistent loops of other queries that a loop needs.
-        max_violating_queries: allowed queries with a free-space violation in a chain of consistent loops.
+        max_violating_queries: allowed queries with a free-space violation in a chain of consistent loops, for each
+            `QUERIES` queries of the chain, rounded up: what was moved, or a wrong depth, violates a long chain more
+            often than a short one.
     """
 
     max_query_gap: int = number(30, low=0)
@@ -80,8 +84,11 @@ def spatially_consistent(
     is_evidence = np.arange(len(every)) < len(loops)
     backs = is_evidence[other] & (queries[one] != queries[other])
     num_others = _num_different(one[backs], queries[other[backs]], len(every))
-    num_against = _num_different(group[~is_evidence], queries[~is_evidence], len(every))[group]
-    is_accepted = (num_others >= config.min_others) & (num_against <= config.max_violating_queries)
+    num_for, num_against = (
+        _num_different(group[of], queries[of], len(every))[group] for of in (is_evidence, ~is_evidence)
+    )
+    is_allowed = num_against <= config.max_violating_queries * np.ceil(num_for / QUERIES)
+    is_accepted = (num_others >= config.min_others) & is_allowed
     return is_accepted[: len(loops)]
 
 

@@ -6,7 +6,7 @@ with the keyframes just before the query, never with an absolute threshold.
 """
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 
 import cv2
@@ -18,6 +18,7 @@ from emgs_jax.ops.ranges import number
 
 # Scale of a unit descriptor's entries as bytes; few exceed a half, and SIFT itself clips its own at .2.
 BYTES_PER_UNIT = 512.0
+BLOCK = 64  # queries that are compared with all keyframes at once
 
 
 @dataclass(frozen=True)
@@ -164,13 +165,40 @@ def add_keyframe(database: Database, keyframe: Keyframe, config: PlaceRecognitio
     return train_database(keyframes, config)
 
 
+def with_keyframes(database: Database, keyframes: Sequence[Keyframe], config: PlaceRecognitionConfig) -> Database:
+    """Add the keyframes of another run, in the order of their frames; words are retrained as by `add_keyframe`."""
+    every = [*database.keyframes, *keyframes]
+    order = np.argsort([one.frame for one in every], kind="stable")
+    ordered = tuple(every[row] for row in order)
+    if len(every) >= 2 * database.num_trained:
+        return train_database(ordered, config)
+    vectors = np.vstack([database.vectors, *(vlad(unit_descriptors(one), database.words) for one in keyframes)])
+    return replace(database, keyframes=ordered, vectors=vectors[order])
+
+
 def train_database(keyframes: Sequence[Keyframe], config: PlaceRecognitionConfig) -> Database:
     """Make a database of keyframes, in their order, with words trained on all of them."""
-    descriptors = np.concatenate([unit_descriptors(one) for one in keyframes])
     sizes = config.num_words, config.max_training, config.num_iterations
-    words = train_words(descriptors, sizes, config.seed)
+    words = train_words(_evenly_chosen(keyframes, _num_chosen(sizes)), sizes, config.seed)
     vectors = np.stack([vlad(unit_descriptors(one), words) for one in keyframes])
     return Database(tuple(keyframes), words, vectors, len(keyframes) if len(words) else 0)
+
+
+def _evenly_chosen(keyframes: Sequence[Keyframe], most: int) -> Float32[np.ndarray, "n 128"]:
+    """Decode descriptors of all keyframes, evenly chosen, at most so many."""
+    ends = np.cumsum([len(one.descriptors) for one in keyframes])
+    parts = np.split(rows := _even_rows(ends[-1], most), np.searchsorted(rows, ends[:-1]))
+    begins = [0, *ends[:-1]]
+    chosen = [unit_descriptors(one)[part - at] for one, part, at in zip(keyframes, parts, begins, strict=True)]
+    return np.concatenate(chosen)
+
+
+def _even_rows(count: int, most: int) -> Int[np.ndarray, " r"]:
+    return np.linspace(0, count - 1, min(count, most)).astype(int)
+
+
+def _num_chosen(sizes: tuple[int, int, int]) -> int:
+    return max(sizes[1], sizes[0])
 
 
 def train_words(
@@ -181,11 +209,10 @@ def train_words(
     Args:
         sizes: number of words, maximal number of descriptors, number of iterations.
     """
-    num_words, max_training, num_iterations = sizes
+    num_words, _, num_iterations = sizes
     if len(descriptors) < num_words:
         return np.zeros((0, descriptors.shape[1]), np.float32)
-    count = min(len(descriptors), max(max_training, num_words))
-    chosen = descriptors[np.linspace(0, len(descriptors) - 1, count).astype(int)]
+    chosen = descriptors[_even_rows(len(descriptors), _num_chosen(sizes))]
     cv2.setRNGSeed(seed)
     stop = (cv2.TERM_CRITERIA_MAX_ITER, num_iterations, 0.0)
     return cv2.kmeans(chosen, num_words, None, stop, 1, cv2.KMEANS_PP_CENTERS)[2]
@@ -215,11 +242,35 @@ def propose_candidates(database: Database, row: int, config: PlaceRecognitionCon
     They are at least `min_gap` frames older. Within `suppressed_gap` frames only the best counts, and there are at most
     `num_candidates`. The threshold is a quantile of the similarity to neighbours (LoopSplat, ViSTA-SLAM).
     """
-    similarity = database.vectors[: row + 1] @ database.vectors[row]
+    (similarity,) = similarities(database, [row])
+    return _proposed(similarity, _frames_of(database), row, config)
+
+
+def propose_for_all(database: Database, rows: Sequence[int], config: PlaceRecognitionConfig) -> Iterator[list[int]]:
+    """Yield what `propose_candidates` returns for each row, and read the vectors once for a block of rows."""
+    frames = _frames_of(database)
+    for begin in range(0, len(rows), BLOCK):
+        block = rows[begin : begin + BLOCK]
+        for row, similarity in zip(block, similarities(database, block), strict=True):
+            yield _proposed(similarity, frames, row, config)
+
+
+def similarities(database: Database, rows: Sequence[int]) -> Float32[np.ndarray, "r n"]:
+    """Compute the similarity of some keyframes to all up to the last of them."""
+    return database.vectors[[*rows]] @ database.vectors[: max(rows) + 1].T
+
+
+def _frames_of(database: Database) -> Int[np.ndarray, " n"]:
+    return np.array([keyframe.frame for keyframe in database.keyframes])
+
+
+def _proposed(
+    similarity: Float32[np.ndarray, " m"], frames: Int[np.ndarray, " n"], row: int, config: PlaceRecognitionConfig
+) -> list[int]:
+    similarity, frames = similarity[: row + 1], frames[: row + 1]
     neighbours = similarity[max(row - config.num_neighbours, 0) : row]
     if not len(neighbours):
         return []
-    frames = np.array([keyframe.frame for keyframe in database.keyframes[: row + 1]])
     is_old = frames <= frames[row] - max(config.min_gap, 1)
     # An image without keypoints is similar to none, not even itself.
     is_alike = (similarity >= np.quantile(neighbours, config.quantile)) & (similarity > 0)
@@ -234,7 +285,7 @@ def most_similar(
     There is no threshold, because that of `propose_candidates` comes from the query's neighbours in time.
     """
     similarity = database.vectors @ vlad(unit_descriptors(query), database.words)
-    frames = np.array([keyframe.frame for keyframe in database.keyframes])
+    frames = _frames_of(database)
     is_allowed = np.zeros(len(frames), bool)
     is_allowed[list(rows)] = True
     return _apart(similarity, frames, is_allowed & (similarity > 0), count, config.suppressed_gap)
@@ -249,10 +300,10 @@ def _apart(
 ) -> list[int]:
     """Choose the most similar allowed rows, at most `count`, each more than `gap` frames from better ones."""
     chosen: list[int] = []
-    for row in np.argsort(-similarity, kind="stable"):
-        apart = [abs(frames[row] - frames[one]) > gap for one in chosen]
-        if is_allowed[row] and all(apart) and len(chosen) < count:
-            chosen.append(int(row))
+    left = np.where(is_allowed, similarity, -np.inf)
+    while len(chosen) < min(count, len(left)) and left[best := int(np.argmax(left))] > -np.inf:
+        chosen.append(best)
+        left[np.abs(frames - frames[best]) <= gap] = -np.inf
     return chosen
 
 

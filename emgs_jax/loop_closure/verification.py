@@ -5,7 +5,7 @@ consistency tells them apart, see `consistency`.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -120,8 +120,8 @@ def verify(
 def neighbours_of(
     candidate: Keyframe,
     others: Sequence[Keyframe],
-    poses: Sequence[Float[np.ndarray, "4 4"]],
-    log_scales: Sequence[float],
+    poses: Sequence[Float[np.ndarray, "4 4"]] | Mapping[int, Float[np.ndarray, "4 4"]],
+    log_scales: Sequence[float] | Mapping[int, float],
 ) -> list[Neighbour]:
     """Return other keyframes with their poses and log-scales relative to a candidate; inputs are indexed by frame."""
     inverse, scale = np.linalg.inv(poses[candidate.frame]), log_scales[candidate.frame]

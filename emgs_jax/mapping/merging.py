@@ -21,7 +21,7 @@ from emgs_jax.back_end.saved_map import LEFT_OUT
 from emgs_jax.back_end.state import BackEnd, Node, transform_nodes
 from emgs_jax.gaussian_map import transformed
 from emgs_jax.geometry import Sim3, scale_pose
-from emgs_jax.loop_closure.place_recognition import keyframes_but, train_database
+from emgs_jax.loop_closure.place_recognition import keyframes_but, with_keyframes
 from emgs_jax.loop_closure.verification import LoopMeasurement
 from emgs_jax.mapping.atlas import Atlas, Submap, with_state
 from emgs_jax.mapping.capacity import add_map
@@ -81,11 +81,11 @@ def beside(atlas: Atlas, other: Atlas) -> Atlas:
     )
     nodes = [*here.graph.nodes, *others]
     graphs = here.graph, there.graph
-    keyframes = sorted((one for graph in graphs for one in graph.database.keyframes), key=lambda one: one.frame)
+    of_other, config = graphs[1].database.keyframes, here.graph.config.place_recognition
     graph = replace(
         here.graph,
         nodes=tuple(nodes[row] for row in np.argsort(np.concatenate(rows))),
-        database=train_database(keyframes, here.graph.config.place_recognition),
+        database=with_keyframes(graphs[0].database, of_other, config),
         first_node=a + b,
         connected_since=0,
         **{name: [one for graph in graphs for one in getattr(graph, name)] for name in MEASURED},

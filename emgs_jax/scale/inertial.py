@@ -24,6 +24,7 @@ from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation
 
+from emgs_jax.data.rosbag import is_bag, read_imu
 from emgs_jax.data.timestamps import in_seconds
 from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.lines import numbers_in, words_of
@@ -69,15 +70,42 @@ class Window(NamedTuple):
     positions: Float[np.ndarray, "k 3"]
 
 
-def read_inertial(path: Path) -> Inertial:
-    """Read time, three rates and three accelerations a line, with commas or spaces, such as EuRoC's imu0/data.csv.
+def read_inertial(given: str) -> Inertial:
+    """Read what a unit measured: a file with a line for each time, or a bag of ROS.
+
+    Args:
+        given: a file of time, three rates and three accelerations a line, with commas or spaces, such as EuRoC's
+            imu0/data.csv; a bag with one topic of sensor_msgs/Imu; or BAG:/TOPIC.
 
     Raises:
-        ValueError: there is no such file, a line has other numbers, times do not ascend, or accelerations are without
-            gravity.
+        ValueError: there is no such file, a line has other numbers, times do not ascend, rates are all 0, or
+            accelerations are without gravity.
     """
+    name, _, topic = given.partition(":/")
+    path = Path(name).expanduser()
+    if is_bag(path):
+        table = read_imu(path, f"/{topic}" if topic else None)
+    else:
+        path = Path(given).expanduser()
+        table = _table_of(path)
+    if len(table) < 10 or (np.diff(table[:, 0]) <= 0).any() or not np.isfinite(table).all():
+        raise ValueError(
+            f"{given} must have ten measurements or more with ascending times, and has {len(table)} with numbers"
+        )
+    length = float(np.median(np.linalg.norm(table[:, 4:], axis=1)))
+    if not 0.7 * GRAVITY <= length <= 1.4 * GRAVITY:
+        raise ValueError(
+            f"{given}: the accelerations are {length:.3g} long, in the median, and should be near {GRAVITY}: give what "
+            "the unit measures, gravity included, in m/s² (1 g = 9.81), in the columns time, rates, accelerations"
+        )
+    if not table[:, 1:4].any():
+        raise ValueError(f"{given}: all rates are 0: give one file or topic with rates and accelerations")
+    return Inertial(in_seconds(table[:, 0]), table[:, 1:4], table[:, 4:])
+
+
+def _table_of(path: Path) -> Float[np.ndarray, "m 7"]:
     if not path.is_file():
-        raise ValueError(f"scale.imu={path} is no file: give one with time, rates and accelerations a line")
+        raise ValueError(f"scale.imu={path} is no file: give one with time, rates and accelerations a line, or a bag")
     rows = []
     for number, line, words in words_of(path):
         values = numbers_in(words[:7])
@@ -89,16 +117,7 @@ def read_inertial(path: Path) -> Inertial:
                 f"{line!r}"
             )
         rows.append(values)
-    table = np.array(rows, np.float64).reshape(-1, 7)
-    if len(table) < 10 or (np.diff(table[:, 0]) <= 0).any():
-        raise ValueError(f"{path} must have ten lines or more with ascending times, and has {len(table)} with numbers")
-    length = float(np.median(np.linalg.norm(table[:, 4:], axis=1)))
-    if not 0.7 * GRAVITY <= length <= 1.4 * GRAVITY:
-        raise ValueError(
-            f"{path}: the accelerations are {length:.3g} long, in the median, and should be near {GRAVITY}: give what "
-            "the unit measures, gravity included, in m/s² (1 g = 9.81), in the columns time, rates, accelerations"
-        )
-    return Inertial(in_seconds(table[:, 0]), table[:, 1:4], table[:, 4:])
+    return np.array(rows, np.float64).reshape(-1, 7)
 
 
 def scale_of_motion(

@@ -34,7 +34,7 @@ class ScaleConfig:
     height: float | None = number(None, low=1e-3, high=1e4)  # metres of the camera above the floor, in the median
     # Of the cameras: exif (GPS of photos), dataset (its poses, in metres), or a file, see `read_positions`
     positions: str | None = None
-    imu: str | None = None  # file of an inertial measurement unit, see `read_inertial`
+    imu: str | None = None  # of an inertial measurement unit, see `read_inertial`
     # camera → unit: 16 numbers row by row, or a sensor.yaml of the camera as EuRoC has
     T_imu_camera: Sequence[float] | str | None = number(None, low=-1e3, high=1e3)
 
@@ -124,7 +124,7 @@ def _read(config: ScaleConfig, dataset: Dataset) -> Read:
     positions = None if config.positions is None else _positions(config.positions, dataset)
     if config.imu is None:
         return Read(positions, None, None)
-    return Read(positions, read_inertial(Path(config.imu).expanduser()), _mounted(config))
+    return Read(positions, read_inertial(config.imu), _mounted(config))
 
 
 def _of_world(

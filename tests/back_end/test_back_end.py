@@ -24,8 +24,8 @@ from emgs_jax.back_end.factors import (
 )
 from emgs_jax.back_end.loops import (
     consistent_loops,
+    detect_loops_between,
     is_closure_due,
-    loop_chi2,
     not_in_graph,
     query_prior,
     remove_inconsistent,
@@ -40,7 +40,7 @@ from emgs_jax.back_end.optimization import (
     nodes_of,
     one_layer_of_state,
 )
-from emgs_jax.back_end.state import BackEnd, Node, add_node, transform_nodes
+from emgs_jax.back_end.state import BackEnd, Node, Refusal, add_node, transform_nodes
 from emgs_jax.data.images import Images
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.device.clock import Clock
@@ -136,7 +136,7 @@ def test_what_was_measured_without_error_moves_nothing(graph):
     end, closed = close_loops(end, state, [loop(poses)])
     assert error(end.poses, poses) < 1e-5 and end.closures[-1].info.reason == ""
     np.testing.assert_allclose(closed.map.gaussians.means, state.map.gaussians.means, atol=1e-5)
-    assert loop_chi2(end, loop(poses)) < 1e-3 and not is_closure_due(end, [loop(poses)])
+    assert chi2(loop(poses), end.poses, end.log_scales) < 1e-3 and not is_closure_due(end, [loop(poses)])
 
 
 def test_a_loop_brings_poses_map_and_last_frame_back(graph):
@@ -146,7 +146,7 @@ def test_a_loop_brings_poses_map_and_last_frame_back(graph):
     end = walked(graph, drifted)
     state = state_of(drifted)
     loops = [loop(truth, row) for row in range(1, 9)]
-    assert loop_chi2(end, loops[0]) > graph.min_violation and is_closure_due(end, loops)
+    assert chi2(loops[0], end.poses, end.log_scales) > graph.min_violation and is_closure_due(end, loops)
     before, gap = error(drifted, truth), lambda poses: np.linalg.norm(poses[1][:3, 3] - poses[-2][:3, 3])
     end, closed = close_loops(end, state, loops)
     assert end.accepted == loops and not is_closure_due(end, loops)
@@ -231,6 +231,22 @@ def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatc
     change = end.poses[-1] @ np.linalg.inv(before)
     assert np.linalg.norm(change[:3, 3]) > 1e-3
     np.testing.assert_allclose(atlas.world.motion.as_matrix(), change @ motion.as_matrix(), atol=1e-5)
+
+
+def test_a_keyframe_of_a_walk_in_chunks_has_no_more_candidates_than_in_one_run(graph, monkeypatch):
+    """However often its chunk is joined: two candidates of the last one were tested before, five are allowed."""
+    end, images = BackEnd(graph, (1, 1, 1, 1), 0.01), np.zeros((0, 2), np.float32)
+    poses = np.eye(4)
+    nodes = tuple(Node(poses, poses, 0.0, row, submap=int(row > 6)) for row in range(9))
+    keyframes = tuple(Keyframe(row, images, images, images, (1, 1, 1, 1), (4, 3), images) for row in range(9))
+    before = [Refusal(7, 8, "matches", 0.0), Refusal(5, 8, "matches", 0.0)]
+    end = replace(end, nodes=nodes, database=Database(keyframes), refusals=before)
+    tested = []
+    everything = lambda database, rows, config: iter([[*range(row)] for row in rows])  # noqa: E731
+    monkeypatch.setattr(back_end.loops, "propose_for_all", everything)
+    monkeypatch.setattr(back_end.loops, "_verify_candidate", lambda end, *pair, **_: tested.append(pair) or end)
+    detect_loops_between(end, 1, is_one_walk=True)
+    assert tested == [(7, 0), (7, 1), (7, 2), (7, 3), (7, 4), (8, 0), (8, 1), (8, 2)]
 
 
 def test_a_loop_that_cannot_be_solved_changes_nothing(graph):

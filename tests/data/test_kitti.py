@@ -35,6 +35,16 @@ def test_poses_may_stand_beside_the_images_or_be_missing(kitti_root):
     assert load(kitti_root).pose(1) is None
 
 
+def test_a_download_of_grey_images_needs_no_setting(kitti_root):
+    folder, in_colour = kitti_root / "sequences" / "07", load(kitti_root)
+    (folder / "image_2").rename(folder / "image_0")
+    grey = load(kitti_root)
+    assert grey.fingerprint() == load(kitti_root, camera=0).fingerprint() != in_colour.fingerprint()
+    assert not np.allclose(grey.pose(1), in_colour.pose(1)), "the left grey camera is the one that has the poses"
+    with pytest.raises(FileNotFoundError, match=r"image_2 is no folder"):
+        load(kitti_root, camera=2)
+
+
 def test_only_positions_of_images_in_use_have_to_be_near(kitti_root):
     """Sequence 01 goes 1.8 km; its first part does not."""
     rows = np.array([scene_pose(i)[:3].ravel() for i in range(3)])

@@ -86,3 +86,26 @@ def write_bag(folder, version=2, kind="Image", others=(), **options):
             encode = store.serialize_ros1 if version == 1 else store.serialize_cdr
             bag.write(topics[topic], time, encode(message, msgtype))
     return path
+
+
+def write_imu(folder, version, table, topics=("/imu",), delay=0):
+    """A bag of what inertial measurement units measured: rows of nanoseconds, three rates, three accelerations.
+
+    Args:
+        delay: nanoseconds from measurement to arrival.
+    """
+    store = get_typestore(Stores.ROS1_NOETIC if version == 1 else Stores.ROS2_HUMBLE)
+    path = folder / ("imu.bag" if version == 1 else "imu")
+    kind, types, extra = "sensor_msgs/msg/Imu", store.types, {"seq": 0} if version == 1 else {}
+    encode = store.serialize_ros1 if version == 1 else store.serialize_cdr
+    turn, unknown = types["geometry_msgs/msg/Quaternion"](0.0, 0.0, 0.0, 1.0), np.zeros(9)
+    with Writer1(path) if version == 1 else Writer2(path, version=9) as bag:
+        for topic in topics:
+            connection = bag.add_connection(topic, kind, typestore=store)
+            for taken, *values in table:
+                time = types["builtin_interfaces/msg/Time"](*divmod(int(taken), 10**9))
+                header = types["std_msgs/msg/Header"](stamp=time, frame_id="imu", **extra)
+                rates, forces = (types["geometry_msgs/msg/Vector3"](*values[k : k + 3]) for k in (0, 3))
+                message = types[kind](header, turn, unknown, rates, unknown, forces, unknown)
+                bag.write(connection, int(taken) + delay, encode(message, kind))
+    return path

@@ -14,9 +14,12 @@ from emgs_jax.loop_closure.place_recognition import (
     add_keyframe,
     make_keyframe,
     propose_candidates,
+    propose_for_all,
+    train_database,
     train_words,
     unit_descriptors,
     vlad,
+    with_keyframes,
 )
 
 
@@ -153,6 +156,14 @@ def test_candidates_are_old_apart_in_time_few_and_the_most_alike_first():
     assert proposed(60) == [44]
 
 
+def test_candidates_of_many_are_those_of_each():
+    database, config = walk(100, lap=40)
+    rows = [3, *range(30, 100)]
+    each = [propose_candidates(database, row, config) for row in rows]
+    assert [*propose_for_all(database, rows, config)] == each and any(map(len, each))
+    assert [*propose_for_all(database, [], config)] == []
+
+
 def test_the_threshold_is_that_quantile_of_the_similarity_to_the_last_neighbours():
     database = alike((0, 100, 197, 198, 200), (0.7, 0.6, 0.5, 0.9, 1.0))
     config = place_recognition_config("num_neighbours=2", "quantile=0.5", "min_gap=50")
@@ -201,6 +212,28 @@ def test_words_are_trained_anew_when_there_are_twice_as_many_keyframes():
             database.vectors[0], vlad(unit_descriptors(database.keyframes[0]), database.words)
         )
     assert trained == [1, 2, 2, 4, 4, 4, 4, 8, 8]
+
+
+def test_keyframes_of_another_run_are_in_order_and_words_stay_until_there_are_twice_as_many():
+    config = place_recognition_config("num_words=16")
+    every = [as_keyframe(frame, 30 * frame + np.arange(100)) for frame in range(12)]
+    here = train_database(every[2:8], config)
+    found = with_keyframes(here, [*every[:2], *every[8:11]], config)
+    assert [one.frame for one in found.keyframes] == [*range(11)] and found.num_trained == 6
+    np.testing.assert_array_equal(found.words, here.words)
+    for one, vector in zip(found.keyframes, found.vectors, strict=True):
+        np.testing.assert_array_equal(vector, vlad(unit_descriptors(one), here.words))
+    twice, trained = with_keyframes(here, [*every[:2], *every[8:]], config), train_database(every, config)
+    assert twice.num_trained == 12
+    np.testing.assert_array_equal(twice.vectors, trained.vectors)
+
+
+def test_words_are_trained_on_an_even_choice_of_all_descriptors():
+    config = place_recognition_config("num_words=16", "max_training=137")
+    keyframes = [as_keyframe(frame, 30 * frame + np.arange(30 + 20 * (frame % 3))) for frame in range(9)]
+    descriptors = np.concatenate([unit_descriptors(one) for one in keyframes])
+    expected = train_words(descriptors, (16, 137, config.num_iterations), config.seed)
+    np.testing.assert_array_equal(train_database(keyframes, config).words, expected)
 
 
 def test_it_is_the_same_each_time():

@@ -96,7 +96,7 @@ def test_a_table_of_euroc_is_read(tmp_path):
     path = tmp_path / "data.csv"
     rows = [f"{1403715273262142976 + 5000000 * row},0.1,0.2,0.3,9.1,0.1,-3.7" for row in range(12)]
     path.write_text("#timestamp [ns],w_x,w_y,w_z,a_x,a_y,a_z\n" + "\n".join(rows))
-    measured = read_inertial(path)
+    measured = read_inertial(str(path))
     assert np.diff(measured.times) == pytest.approx(0.005, abs=1e-6)
     assert measured.rates[3] == pytest.approx([0.1, 0.2, 0.3]) and measured.accelerations[3, 2] == -3.7
 
@@ -113,6 +113,46 @@ def test_tables_of_something_else_are_named(tmp_path, row, message):
     path = tmp_path / "imu.txt"
     path.write_text("time wx wy wz ax ay az\n" + "\n".join(row.format(t=0.01 * index) for index in range(20)))
     with pytest.raises(ValueError, match=message):
-        read_inertial(path)
+        read_inertial(str(path))
     with pytest.raises(ValueError, match="scale.imu=.* is no file"):
-        read_inertial(tmp_path / "none.csv")
+        read_inertial(str(tmp_path / "none.csv"))
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_a_topic_of_a_bag_is_read_as_a_table_is(tmp_path, version):
+    """Its times are those of the headers, not of the recording, which is late."""
+    pytest.importorskip("rosbags", reason="reads bags: pip install -e .[rosbag]")
+    from tests.data.written_bag import write_imu
+
+    rng = np.random.default_rng(0)
+    stamps = 1_700_000_000_000_000_000 + 5_000_000 * np.arange(40)
+    rows = rng.normal(size=(40, 6)) + [0, 0, 0, 0, 0, GRAVITY]
+    table = [(int(stamp), *row) for stamp, row in zip(stamps, rows, strict=True)]
+    shuffled = [*table[:7], table[8], table[7], *table[9:], table[-1]]  # late, and twice
+    bag = str(write_imu(tmp_path, version, shuffled, delay=30_000_000))
+    (tmp_path / "data.csv").write_text(
+        "\n".join(f"{stamp}, {', '.join(map(repr, map(float, row)))}" for stamp, *row in table)
+    )
+    expected = read_inertial(str(tmp_path / "data.csv"))
+    for given in (bag, f"{bag}:/imu"):
+        found = read_inertial(given)
+        np.testing.assert_allclose(found.times, expected.times, rtol=0, atol=1e-6)
+        np.testing.assert_array_equal(found.rates, expected.rates)
+        np.testing.assert_array_equal(found.accelerations, rows[:, 3:])
+
+
+def test_a_bag_of_several_units_asks_which_and_one_without_rates_is_refused(tmp_path):
+    pytest.importorskip("rosbags", reason="reads bags: pip install -e .[rosbag]")
+    from tests.data.written_bag import write_imu
+
+    table = [(10**9 + row, 0.1, 0, 0, 0, 0, 9.8) for row in range(20)]
+    bag = write_imu(tmp_path, 2, table, ("/left/imu", "/right/imu"))
+    with pytest.raises(ValueError, match=r"several of .*Imu: give scale.imu=\S*imu:TOPIC, one of /left/imu, /"):
+        read_inertial(str(bag))
+    with pytest.raises(ValueError, match="no topic /imu"):
+        read_inertial(f"{bag}:/imu")
+    assert len(read_inertial(f"{bag}:/right/imu").times) == 20
+    (tmp_path / "one").mkdir()
+    still = write_imu(tmp_path / "one", 2, [(time, 0, 0, 0, *rest) for time, _, _, _, *rest in table])
+    with pytest.raises(ValueError, match="all rates are 0"):
+        read_inertial(str(still))

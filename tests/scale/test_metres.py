@@ -192,7 +192,7 @@ def test_a_file_that_is_not_there_ends_a_run_whatever_else_is_known(tmp_path):
     with pytest.raises(ValueError, match="imu=.* is no file"):
         measured(tmp_path, ScaleConfig(height=HEIGHT, imu=str(tmp_path / "none.csv"), T_imu_camera=np.eye(4).ravel()))
     path = tmp_path / "imu.csv"
-    path.write_text("\n".join(f"{100 + 0.005 * row} 0 0 0 0 0 9.81" for row in range(400)))
+    path.write_text("\n".join(f"{100 + 0.005 * row} .1 0 0 0 0 9.81" for row in range(400)))
     (found,) = measured(tmp_path, ScaleConfig(height=HEIGHT, imu=str(path), T_imu_camera=np.eye(4).ravel()))
     assert found.scale is not None and any("by the clock of the images" in note for note in found.notes)
 
@@ -213,7 +213,7 @@ def test_what_is_given_is_checked_before_images_are_read(given, message):
 
 def test_an_extrinsic_that_is_no_rigid_motion_is_named(tmp_path):
     path = tmp_path / "imu.txt"
-    path.write_text("\n".join(f"{0.005 * row} 0 0 0 0 0 9.81" for row in range(4000)))
+    path.write_text("\n".join(f"{0.005 * row} .1 0 0 0 0 9.81" for row in range(4000)))
     with pytest.raises(ValueError, match=r"scale.T_imu_camera must be the 16 numbers"):
         measured(tmp_path, ScaleConfig(imu=str(path), T_imu_camera=[1.0] * 16))
 

@@ -6,16 +6,21 @@ from pathlib import Path
 import numpy as np
 import own_process
 import pytest
-from tiny_run import SMOKE, compose
+from loop_scene import matrix
+from tiny_run import TINY, compose
 
 from emgs_jax.config import configure
 from emgs_jax.config.configure import build_dataset
 from emgs_jax.io.files import owned
+from emgs_jax.mapping import tracking, window_input
+from emgs_jax.mapping.window_input import first_pose
 from emgs_jax.runs.finished_run import read_run
 from emgs_jax.runs.images import images_of
 from experiments import chunks
 from experiments.chunks import cut, num_frames, run_chunks, words_of
 from experiments.run import run
+
+pytestmark = pytest.mark.xdist_group("tiny")
 
 
 @pytest.mark.parametrize("num", [2, 3, 4, 7, 12])
@@ -86,41 +91,126 @@ def test_all_chunks_that_are_missing_are_named_if_too_few_are_left(tmp_path, mon
     ]
 
 
-WALK = (*SMOKE, "dataset.num_frames=80", "dataset.stop=24", "prior.level=0", "graph=default")
-CHUNKS = ("chunks=3", "overlap=4")  # frames 0 to 9, 6 to 16, 13 to 23
+WALK = ("dataset.stop=12", "prior.level=0", "graph=default", "checkpoint.every=2")
+CHUNKS = ("chunks=3", "overlap=2")  # frames 0 to 4, 3 to 7, 6 to 11
+WHOLE = "3 chunks of up to 6 frames, {} of them to do"
+
+
+def in_this_process(folder: Path, todo: list[list[str]], job) -> list[str]:
+    """A launcher for which each chunk begins in a world of its own, as with images alone: only a join places it."""
+    said = []
+    for *own, subfolder in todo:
+        number = int(subfolder.removeprefix("hydra.sweep.subdir="))
+        elsewhere = matrix((20 * number, 60, 10), (4.0, number, -3.0))
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(window_input, "first_pose", lambda frames, at=elsewhere: at @ first_pose(frames))
+            try:
+                run(compose(*WALK, *CHUNKS, *own), folder / str(number))
+                said.append("")
+            except ValueError as error:
+                said.append(str(error))
+    return said
+
+
+@pytest.fixture
+def walk_to(monkeypatch):
+    """Run the walk in chunks into a folder, in this process."""
+    monkeypatch.setattr(chunks, "launch", in_this_process)
+    return lambda folder: run_chunks(compose(*WALK, *CHUNKS), folder, None)[1]
+
+
+@pytest.fixture(scope="module")
+def undisturbed(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("undisturbed")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(chunks, "launch", in_this_process)
+        assert not run_chunks(compose(*WALK, *CHUNKS), folder, None)[1]
+    check_joined(folder, [*range(12)])
+    return folder
 
 
 def times_of(folder: Path) -> dict[str, int]:
     return {path.parent.name: path.stat().st_mtime_ns for path in folder.glob("chunks/*/metrics.json")}
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("launcher", ["basic", pytest.param("joblib", marks=pytest.mark.weekly)])
-def test_what_is_missing_is_named_and_made_by_the_same_command_again_and_the_rest_is_joined(tmp_path, launcher):
-    """The last chunk cannot be written at first. The prior is exact, so the joined path is the true one.
+def same_files(folder: Path, other: Path) -> None:
+    """Map, path and factors, to the bit."""
+    for name in ("map.npz", "trajectory.txt", "places.npz", "graph.g2o", "loops.json"):
+        assert (folder / name).read_bytes() == (other / name).read_bytes(), name
 
-    It predicts in the world of the truth, in which the chunks fit each other as they are: where a join places a map in
-    another world and unit is tested in runs/test_shared_frames.py and mapping/test_merging.py.
-    """
+
+@pytest.mark.slow
+def test_a_chunk_that_is_missing_is_named_and_made_by_the_same_command_again_and_the_rest_is_joined(
+    tmp_path, walk_to, undisturbed
+):
+    """The last chunk cannot be written at first. The prior is exact, so the joined path is the true one."""
+    with owned(tmp_path / "chunks" / "3"):
+        (problem,) = walk_to(tmp_path)
+    assert problem.startswith("chunk 3 (dataset.start=6 dataset.stop=12) is missing: another program is writing")
+    first = times_of(tmp_path)
+    assert first.keys() == {"1", "2"}
+    check_joined(tmp_path, [*range(8)])
+
+    assert walk_to(tmp_path) == []
+    assert {name: time for name, time in times_of(tmp_path).items() if name in first} == first
+    check_joined(tmp_path, [*range(12)])
+    assert (tmp_path / "previous-1" / "metrics.json").exists() and (tmp_path / "report.html").exists()
+    same_files(tmp_path, undisturbed)
+
+
+class Killed(BaseException):
+    """As a signal is: nobody catches it as an error."""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("number", [pytest.param(2, marks=pytest.mark.weekly), 7])
+def test_a_walk_that_is_killed_while_a_chunk_maps_has_the_same_map_in_the_end(
+    tmp_path, walk_to, undisturbed, monkeypatch, number
+):
+    """Before this step of all chunks: in the first and in the second one."""
+    steps, advance = [], tracking.advance
+
+    def counted(*arguments):
+        steps.append(1)
+        if len(steps) == number:
+            raise Killed
+        return advance(*arguments)
+
+    monkeypatch.setattr(tracking, "advance", counted)
+    with pytest.raises(Killed):
+        walk_to(tmp_path)
+    assert not (tmp_path / "map.npz").exists() and len(times_of(tmp_path)) == number // 5
+    assert walk_to(tmp_path) == []
+    same_files(tmp_path, undisturbed)
+
+
+@pytest.mark.weekly
+@pytest.mark.parametrize("launcher", ["basic", "joblib"])
+def test_the_command_goes_on_where_it_was_killed(tmp_path, launcher):
+    """By SIGKILL, while the second chunk maps; then the third one cannot be written."""
     if launcher != "basic":
         pytest.importorskip(f"hydra_plugins.hydra_{launcher}_launcher")
-    folder = tmp_path / "walk"
-    words = (*WALK, *CHUNKS, f"hydra/launcher={launcher}", f"hydra.run.dir={folder}")
-    with owned(folder / "chunks" / "3"):
+    words = (*TINY, *WALK, *CHUNKS, f"hydra/launcher={launcher}")
+    folders = {name: tmp_path / name for name in ("whole", "killed")}
+    done = own_process.run("experiments.run", *words, f"hydra.run.dir={folders['whole']}", timeout=600)
+    assert done.returncode == 0 and WHOLE.format(3) in done.stderr + done.stdout, done.stderr
+    check_joined(folders["whole"], [*range(12)])
+
+    words, log = (*words, f"hydra.run.dir={folders['killed']}"), folders["killed"] / "chunks" / "2" / "frames.jsonl"
+    program = own_process.begin("experiments.run", *words, said=tmp_path / "said")
+    own_process.wait_for(lambda: log.exists() and log.read_bytes().count(b"\n") >= 2, program)
+    program.kill()
+    own_process.ended(program)
+    assert not (folders["killed"] / "map.npz").exists()
+    with owned(folders["killed"] / "chunks" / "3"):
         done = own_process.run("experiments.run", *words, timeout=600)
     assert done.returncode == 1, done.stderr
-    assert "error: chunk 3 (dataset.start=13 dataset.stop=24) is missing: another program is writing" in done.stderr
-    assert f"the same command with hydra.run.dir={folder}" in done.stderr
-    first = times_of(folder)
-    assert first.keys() == {"1", "2"}
-    check_joined(folder, [*range(17)])
-
+    assert "error: chunk 3 (dataset.start=6 dataset.stop=12) is missing: another program is writing" in done.stderr
+    assert f"the same command with hydra.run.dir={folders['killed']}" in done.stderr
+    check_joined(folders["killed"], [*range(8)])
     done = own_process.run("experiments.run", *words, timeout=600)
-    assert done.returncode == 0, done.stderr
-    assert "3 chunks of up to 11 frames, 1 of them to do" in done.stderr + done.stdout
-    assert {name: time for name, time in times_of(folder).items() if name in first} == first
-    check_joined(folder, [*range(24)])
-    assert (folder / "previous-1" / "metrics.json").exists() and (folder / "report.html").exists()
+    assert done.returncode == 0 and WHOLE.format(1) in done.stderr + done.stdout, done.stderr
+    same_files(folders["killed"], folders["whole"])
 
 
 def check_joined(folder: Path, frames: list[int]) -> None:
@@ -137,4 +227,4 @@ def check_joined(folder: Path, frames: list[int]) -> None:
     metrics, alone = (json.loads((path / "metrics.json").read_text()) for path in (folder, folder / "chunks" / "1"))
     assert metrics["map/double_wall_percent"] < alone["map/double_wall_percent"] + 2
     births = np.asarray(joined.map.birth)[np.asarray(joined.map.gaussians.valid)]
-    assert births.min() >= 0 and frames[-1] >= births.max() > 10
+    assert births.min() >= 0 and frames[-1] >= births.max() > 4
