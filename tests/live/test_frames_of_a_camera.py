@@ -15,7 +15,7 @@ from emgs_jax.data.intrinsics import Pictures, find_lens
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.live import camera, capture
 from emgs_jax.live.camera import Camera
-from emgs_jax.live.newest import Newest, Shot, end_all
+from emgs_jax.live.newest import Newest, Shot, all_closed, end_all
 
 INTRINSICS = (40.0, 40.0, 15.5, 11.5)
 
@@ -102,6 +102,18 @@ def test_only_the_image_that_is_taken_is_read_and_one_that_is_damaged_is_passed_
     shot = newest.take(1.0)
     assert shot.time == 4.0 and read == [1, 4] and newest.num_dropped == 3 and newest.problem is None
     assert before <= shot.arrived <= came, "when it came, not when it was read"
+
+
+def test_an_error_ends_the_thread_that_waits_for_images(tmp_path):
+    """Also that of a recording whose images nobody has asked for."""
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{0.1 * number:.6f}.png"), an_image(number))
+    named = f"camera {tmp_path}"
+    with pytest.raises(ValueError, match="an error"), all_closed():
+        Camera(source=str(tmp_path), intrinsics=INTRINSICS)
+        assert named in {thread.name for thread in threading.enumerate()}
+        raise ValueError("an error")
+    assert named not in {thread.name for thread in threading.enumerate()}
 
 
 def test_a_recorded_image_that_cannot_be_read_ends_the_recording(tmp_path):

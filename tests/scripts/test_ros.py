@@ -134,6 +134,25 @@ def test_what_was_saved_outlives_the_node_and_the_publisher(tmp_path, shared_mem
     np.testing.assert_array_equal(read_run(out / "saved-1").poses, saved.poses)
 
 
+@pytest.mark.slow
+def test_an_error_ends_the_node_by_one_line(tmp_path, shared_memory):
+    """Symptom: "terminate called without an active exception", and an abort, as the thread of rclpy still ran."""
+    words = *TOPICS[:2], "prior=stream", "dataset.size=[64,48]", *OF_ROOM, f"hydra.run.dir={tmp_path / 'run'}"
+    publisher = published(tmp_path)
+    try:
+        found = subprocess.run(
+            [sys.executable, "-m", "experiments.ros", *words],
+            cwd=Path(__file__).parents[2],
+            capture_output=True,
+            text=True,
+            timeout=600,
+        )
+    finally:
+        publisher.kill()
+    assert found.returncode == 1, found.stderr
+    assert found.stderr.count("error: ") == 1 and "is not beside" in found.stderr and "terminate" not in found.stderr
+
+
 def published(folder: Path, fps: float = 30.0) -> subprocess.Popen:
     """A publisher of the tiny room's frames with depth and odometry, over and over."""
     recorded = folder / "played"
