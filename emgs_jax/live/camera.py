@@ -125,9 +125,9 @@ class Camera(Straightened):
         elif self._bent is None and "depth" in given:
             raise ValueError("with a depth for each image dataset.intrinsics=[fx,fy,cx,cy] are needed, not estimate")
         if given:
-            with atomic_write(path.with_suffix(".npz")) as handle:
+            with atomic_write(path.with_suffix(".npz"), outlives_power=self.record) as handle:
                 np.savez(handle, **given)
-        with atomic_write(path) as handle:
+        with atomic_write(path, outlives_power=self.record) as handle:
             handle.write(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), FAST)[1])
         self._images.append(path)
         self._times.append(float(path.stem))
