@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 from tqdm import tqdm
 
 from emgs_jax.data.base import Rates, wait_for_all
@@ -130,8 +131,13 @@ class Camera(Straightened):
         with atomic_write(path, outlives_power=self.record) as handle:
             handle.write(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), FAST)[1])
         self._images.append(path)
+        self._last = image
         self._times.append(float(path.stem))
         self._arrived.append(shot.arrived)
+
+    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        """The image on disk; the last one is still here as it was written."""
+        return self._last if index == len(self) - 1 else super()._read(index)
 
     def has(self, index: int) -> bool:
         self._newest.begun.set()

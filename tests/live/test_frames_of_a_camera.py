@@ -396,6 +396,19 @@ def test_a_clock_that_is_set_back_keeps_the_order(source):
     assert wait_for_all(frames) == 2 and frames[1].timestamp > frames[0].timestamp
 
 
+def test_the_last_image_is_not_read_again_and_is_as_it_is_on_the_disk(source, monkeypatch):
+    drawn = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
+    source.give(Shot(0.0, drawn))
+    frames = Camera(source="0", intrinsics=INTRINSICS, size=(32, 24))
+    with monkeypatch.context() as patch:
+        patch.setattr("emgs_jax.data.straightened.read_shown", lambda *_: pytest.fail("it is read"))
+        last = frames[0].image
+    source.give(Shot(1.0, an_image(1)))
+    assert frames.has(1)
+    np.testing.assert_array_equal(last, drawn)
+    np.testing.assert_array_equal(frames[0].image, drawn)
+
+
 @pytest.mark.parametrize("record", [False, True])
 def test_only_a_recording_waits_for_the_disk(source, tmp_path, monkeypatch, record):
     """Symptom: a tenth of the time went to make images outlive a power cut that are deleted when the run ends."""
