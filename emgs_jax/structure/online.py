@@ -394,6 +394,16 @@ def forget(online: Online, number: int) -> None:
     del online.views[number], online.images[number]
 
 
+def forget_follower(online: Online) -> bool:
+    """Forget the last frame if it shows only what its keyframe shows, as if it had not come; True if it does."""
+    number = online.num_frames - 1
+    if number not in online.followers:
+        return False
+    del online.followers[number]
+    online.num_frames = number
+    return True
+
+
 def learn_words(online: Online) -> None:
     """Train place recognition on the keyframes, whenever their number has doubled."""
     descriptors = [unit_descriptors(view) for view in online.views.values()]

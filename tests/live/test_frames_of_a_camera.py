@@ -419,6 +419,23 @@ def test_only_a_recording_waits_for_the_disk(source, tmp_path, monkeypatch, reco
     assert len(synced) == (2 if record else 0)
 
 
+def test_the_last_frame_can_be_left_out_as_if_it_had_not_come(source):
+    given = {"depth": np.ones((24, 32), np.float32)}
+    source.give(Shot(0.0, an_image(0)))
+    camera = Camera(source="0", intrinsics=INTRINSICS, size=(32, 24))
+    frames = ReadableFrames(camera)
+    source.give(Shot(0.1, an_image(1), given))
+    assert frames.has(1) and frames[1].image[0, 0, 0] == 1
+    path = camera.files(1)[0]
+    num_dropped = camera._newest.num_dropped
+    frames.drop_last()
+    assert len(frames) == 1 and not path.exists() and not path.with_suffix(".npz").exists()
+    source.give(Shot(0.2, an_image(2)))
+    assert frames.has(1) and len(frames) == 2
+    assert frames[1].image[0, 0, 0] == 2 and frames[1].timestamp == 0.2 and frames[0].image[0, 0, 0] == 0
+    assert camera._newest.num_dropped == num_dropped + 1
+
+
 def test_images_that_are_not_recorded_are_deleted(source):
     source.give(Shot(0.0, an_image(0)))
     frames = Camera(source="0", intrinsics=INTRINSICS)
