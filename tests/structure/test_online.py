@@ -118,8 +118,9 @@ def test_motions_err_as_their_covariances_say():
 
 
 def test_the_same_images_give_the_same_bits():
+    """Without a number of threads, too."""
     _, found = whole()
-    again = followed(Coming(14))
+    again = followed(Coming(14), "prior.structure.num_threads=-1")
     for frame in range(14):
         other = again(frame)
     for name in ("T_world_camera", "covariance"):
