@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from hydra.errors import InstantiationException
+from listening import compiled
 from scene import compose
 
 from emgs_jax.config.configure import build
@@ -47,6 +48,19 @@ def test_each_frame_is_predicted_when_it_comes_without_later_ones():
     assert [taken for _, taken in found] == [min(frame, COUNT - 1) for frame in wanted]
     assert prior.adjusts_poses
     assert prior.report()["prior/placed_percent"] == 100 and prior.provenance.settings["structure"]["online"]
+
+
+@pytest.mark.slow
+def test_nothing_is_compiled_after_the_images_have_begun(tmp_path):
+    """Symptom: the first map came seconds after the structure had begun, in which the camera moved on."""
+    dataset, prior = Synthetic(num_frames=40, stop=COUNT, size=(136, 104)), build(compose(*WORDS), "prior")
+    prior.check(dataset, 4)
+    with compiled() as before:
+        prior.keep(tmp_path)
+    with compiled() as names:
+        for window, frames in with_frames(calls_of(prior, dataset, 4), dataset):
+            prior.predict(window, list(frames.values()), dataset.intrinsics)
+    assert "estimate_depth" in before and not names
 
 
 @pytest.mark.slow
