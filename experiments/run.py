@@ -20,7 +20,7 @@ from emgs_jax.evaluation.reconstruction import EvaluationConfig
 from emgs_jax.io.files import FrameLog, owned
 from emgs_jax.io.packages import extra
 from emgs_jax.live.camera import RECORDED
-from emgs_jax.live.newest import end_all
+from emgs_jax.live.newest import all_closed, end_all
 from emgs_jax.mapping.capacity import prepared_beside
 from emgs_jax.mapping.checkpoint import CHECKPOINT_FILE, Keeper
 from emgs_jax.mapping.convert import to_camera
@@ -76,6 +76,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         raise ValueError(f"map={config.map} is the folder of this run, too: give hydra.run.dir=ANOTHER")
     with contextlib.ExitStack() as stack:
         stack.enter_context(owned(folder))
+        stack.enter_context(all_closed())
         stack.enter_context(cameras_first(end_all))
         clock = stack.enter_context(Clock().watching())
         with clock.phase("setup"):

@@ -78,6 +78,10 @@ class Dataset(Protocol):
         """Test whether there is a frame `index`; waits for it while more may come."""
         return index < len(self)
 
+    def drop_last(self) -> None:
+        """Leave out the last frame that has come, as if it had not; only while more may come."""
+        raise NotImplementedError
+
     @property
     def total(self) -> int | None:
         """Number of frames; None while more may come."""

@@ -77,6 +77,11 @@ class ReadableFrames:
             num_known += 1
         return index < len(self.kept)
 
+    def drop_last(self) -> None:
+        """Leave out the last frame that has come, as if it had not."""
+        self._places.pop(self.kept.pop(), None)
+        self._dataset.drop_last()
+
     @property
     def total(self) -> int | None:
         """Number of frames; None while more may come."""

@@ -15,15 +15,23 @@ import numpy as np
 
 
 @contextlib.contextmanager
-def atomic_write(path: str | os.PathLike, mode: str = "wb") -> Iterator[IO]:
-    """Open a temporary file, which becomes `path` if the block succeeds; an OSError inside names `path`."""
+def atomic_write(path: str | os.PathLike, mode: str = "wb", outlives_power: bool = True) -> Iterator[IO]:
+    """Open a temporary file, which becomes `path` if the block succeeds; an OSError inside names `path`.
+
+    Args:
+        path: of the file.
+        mode: as of `open`.
+        outlives_power: wait until the content is on the disk, as a power cut would otherwise leave an empty file. A
+            program that is killed leaves whole files without that.
+    """
     path = Path(path)
     temporary = path.with_name(f".{path.stem}.{os.getpid()}.tmp{path.suffix}")
     try:
         with open(temporary, mode, encoding=None if "b" in mode else "utf-8") as handle:
             yield handle
             handle.flush()
-            os.fsync(handle.fileno())
+            if outlives_power:
+                os.fsync(handle.fileno())
         os.replace(temporary, path)
     except OSError as error:
         raise _named(error, path) from error

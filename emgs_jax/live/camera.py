@@ -14,6 +14,7 @@ from typing import Any
 
 import cv2
 import numpy as np
+from jaxtyping import UInt8
 from tqdm import tqdm
 
 from emgs_jax.data.base import Rates, wait_for_all
@@ -125,13 +126,18 @@ class Camera(Straightened):
         elif self._bent is None and "depth" in given:
             raise ValueError("with a depth for each image dataset.intrinsics=[fx,fy,cx,cy] are needed, not estimate")
         if given:
-            with atomic_write(path.with_suffix(".npz")) as handle:
+            with atomic_write(path.with_suffix(".npz"), outlives_power=self.record) as handle:
                 np.savez(handle, **given)
-        with atomic_write(path) as handle:
+        with atomic_write(path, outlives_power=self.record) as handle:
             handle.write(cv2.imencode(".png", cv2.cvtColor(image, cv2.COLOR_RGB2BGR), FAST)[1])
         self._images.append(path)
+        self._last = path, image
         self._times.append(float(path.stem))
         self._arrived.append(shot.arrived)
+
+    def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
+        """The image on disk; the last one that was written is still here."""
+        return self._last[1] if self._images[index] == self._last[0] else super()._read(index)
 
     def has(self, index: int) -> bool:
         self._newest.begun.set()
@@ -148,6 +154,18 @@ class Camera(Straightened):
             self._is_over = True
             return False
         return True
+
+    def drop_last(self) -> None:
+        """Leave out the last frame, as if it had not been taken."""
+        self._remove(self._images.pop())
+        self._times.pop(), self._arrived.pop()
+        self._newest.num_dropped += 1
+
+    @staticmethod
+    def _remove(image: Path) -> None:
+        """Remove an image, and what came with it."""
+        for path in (image, image.with_suffix(".npz")):
+            path.unlink(missing_ok=True)
 
     def _next(self) -> Shot | None:
         """Wait for the next image in use; None after the last one, for the reason that `_newest` has."""
@@ -179,8 +197,7 @@ class Camera(Straightened):
         if shot is None or shot.image.shape[1::-1] != self._raw_size:
             self._arrived[0] = self._begin  # a recording has waited
             return
-        for path in (self._images[0], self._images[0].with_suffix(".npz")):
-            path.unlink(missing_ok=True)
+        self._remove(self._images[0])
         self._images, self._times, self._arrived = [], [], []
         self._newest.num_dropped = 0
         self._add(shot)

@@ -8,6 +8,7 @@ import os
 import threading
 import time
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 
 import cv2
@@ -37,7 +38,7 @@ def start(source: str, into: Newest, needs_camera: bool = False) -> Calibration 
 
         return subscribe(source.split()[1:], into, needs_camera)
     shots = open_source(source, into)
-    threading.Thread(target=_offer, args=(shots, source, into), name=f"camera {source}", daemon=True).start()
+    into.fill(partial(_offer, shots, source, into), f"camera {source}")
     return None
 
 

@@ -1,9 +1,10 @@
 """The newest image of a source that does not wait: a queue would fall behind."""
 
+import contextlib
 import threading
 import time
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -30,6 +31,7 @@ class Shot:
     arrived: float = 0.0
 
 
+LAST_S = 1.0  # longest wait for the thread of a source that has ended: a device may not come back
 Unread: TypeAlias = Callable[[], Shot]  # reads and decodes an image; BadFrameError if it cannot be used
 
 
@@ -48,7 +50,13 @@ class Newest:
         self._changed, self._shot = threading.Condition(), None  # the latter with the time when it came
         self.num_dropped, self.reason, self.problem = 0, None, None
         self.begun, self.can_wait = threading.Event(), False
+        self._thread: threading.Thread | None = None
         _running.add(self)
+
+    def fill(self, give: Callable[[], None], name: str) -> None:
+        """Call what offers the images, and returns once no more are wanted, in a thread."""
+        self._thread = threading.Thread(target=give, name=name, daemon=True)
+        self._thread.start()
 
     def put(self, shot: Shot | Unread) -> bool:
         """Offer an image; returns False if no more are wanted."""
@@ -93,6 +101,13 @@ class Newest:
         with self._changed:
             self.reason = reason if self.reason is None else self.reason
             self._changed.notify_all()
+        self.begun.set()  # a source that waits for it is not wanted
+
+    def close(self) -> None:
+        """End, and wait for the thread: one in rclpy aborts the process if it still runs as Python ends."""
+        self.end("the run has ended")
+        if self._thread is not None:
+            self._thread.join(LAST_S)
 
 
 _running: "weakref.WeakSet[Newest]" = weakref.WeakSet()  # cameras of this process
@@ -104,3 +119,13 @@ def end_all() -> bool:
     for newest in running:
         newest.end("ended by the user")
     return bool(running)
+
+
+@contextlib.contextmanager
+def all_closed() -> Iterator[None]:
+    """Close the cameras of this process after the block, however it ends."""
+    try:
+        yield
+    finally:
+        for newest in [*_running]:
+            newest.close()

@@ -6,7 +6,6 @@ likewise: `odom_frame:=odom`.
 """
 
 import contextlib
-import threading
 import time
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
@@ -139,7 +138,7 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
             node.create_subscription(tf_type, "/tf", add_moving, QoSProfile(depth=100))
     executor = SingleThreadedExecutor()
     executor.add_node(node)
-    threading.Thread(target=_spin, args=(executor, node, into), name="ros", daemon=True).start()
+    into.fill(partial(_spin, executor, node, into), "ros")
     if not needs_camera:
         return None
     end = time.monotonic() + INFO_S

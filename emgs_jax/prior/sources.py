@@ -22,11 +22,20 @@ class Sources(NamedTuple):
 
 def sources_of(found: Structure, frame: int, others: Sequence[int], count: int, view: Callable[[int], Any]) -> Sources:
     """The first `count` of `others`, padded by repetitions that do not count."""
-    is_used = np.arange(count) < len(others)
-    others, poses = (list(others) * count)[:count], found.T_world_camera
+    num_used, poses = len(others), found.T_world_camera
+    others = (list(others) * count)[:count]
     T = np.stack([np.linalg.inv(poses[other]) @ poses[frame] for other in others])
-    T_source_view = jaxlie.SE3.from_matrix(jnp.asarray(T, jnp.float32))
-    return Sources(stack([view(other) for other in others]), T_source_view, jnp.asarray(is_used))
+    return _sources([view(other) for other in others], T, num_used)
+
+
+def _sources(views: Sequence[Any], T_source_view: Float[np.ndarray, "s 4 4"], num_used: int) -> Sources:
+    T = jaxlie.SE3.from_matrix(jnp.asarray(T_source_view, jnp.float32))
+    return Sources(stack(views), T, jnp.asarray(np.arange(len(views)) < num_used))
+
+
+def same_sources(view: Any, count: int) -> Sources:
+    """A view as its own sources, to compile programs before there are others."""
+    return _sources([view] * count, np.stack([np.eye(4)] * count), count)
 
 
 def placed_beside(found: Structure, frame: int) -> list[int]:

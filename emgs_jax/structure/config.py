@@ -29,7 +29,7 @@ class StructureConfig:
     refine_distortion: bool = True  # of a given camera; an estimated one is refined as a whole
     masks: Masks = field(default_factory=Masks)  # where no features are detected
     seed: int = number(0, low=0, high=2**31 - 1)
-    num_threads: int = number(-1, low=-1, high=1024)  # -1: all
+    num_threads: int = number(-1, low=-1, high=1024)  # -1: all; online one
     max_image_size: int = number(1024, low=64, high=16384)  # longer side in pixels, to which images are reduced
     max_exhaustive: int = number(50, low=2, high=10000)  # images up to which all pairs are matched
     overlap: int = number(10, low=1, high=1000)  # of more images: neighbours on each side, and powers of two beyond

@@ -213,8 +213,12 @@ def mapper_of(online: Online, model: Any, around: Sequence[int] | None = None) -
 
 
 def settings(online: Online, angle: float = ANGLES[0], is_bent: bool = False) -> tuple[Any, Any, Any]:
-    """COLMAP's options of mapper, adjustment and triangulation; `is_bent`: the distortion is adjusted, too."""
-    common = {"num_threads": online.config.num_threads, "random_seed": online.config.seed}
+    """COLMAP's options of mapper, adjustment and triangulation; `is_bent`: the distortion is adjusted, too.
+
+    Without a number of threads there is one: with all of them the same images do not give the same bits.
+    """
+    num_threads = max(online.config.num_threads, 1)
+    common = {"num_threads": num_threads, "random_seed": online.config.seed}
     mapper = {
         "init_min_tri_angle": angle,
         "init_max_reg_trials": 1000,
@@ -228,7 +232,7 @@ def settings(online: Online, angle: float = ANGLES[0], is_bent: bool = False) ->
     adjustment = options_of("BundleAdjustmentOptions", refined)
     adjustment.ceres.loss_function_type = load().LossFunctionType.CAUCHY
     solver = adjustment.ceres.solver_options
-    solver.num_threads, solver.function_tolerance, solver.max_num_iterations = online.config.num_threads, 1e-5, 50
+    solver.num_threads, solver.function_tolerance, solver.max_num_iterations = num_threads, 1e-5, 50
     triangulation = load().IncrementalTriangulatorOptions(random_seed=online.config.seed)
     return load().IncrementalMapperOptions(**common, **mapper), adjustment, triangulation
 
@@ -392,6 +396,16 @@ def forget(online: Online, number: int) -> None:
     for key in [key for key in online.pairs if number in key]:
         del online.pairs[key], online.E[key]
     del online.views[number], online.images[number]
+
+
+def forget_follower(online: Online) -> bool:
+    """Forget the last frame if it shows only what its keyframe shows, as if it had not come; True if it does."""
+    number = online.num_frames - 1
+    if number not in online.followers:
+        return False
+    del online.followers[number]
+    online.num_frames = number
+    return True
 
 
 def learn_words(online: Online) -> None:

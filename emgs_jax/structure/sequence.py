@@ -1,5 +1,6 @@
 """The structure of a data set's images, and self-calibration."""
 
+import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -15,10 +16,11 @@ from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import in_use
 from emgs_jax.structure.library import load
 from emgs_jax.structure.model import Structure, to_structure
-from emgs_jax.structure.online import CAMERA, Online, add, newest
+from emgs_jax.structure.online import CAMERA, Online, add, forget_follower, newest
 from emgs_jax.structure.shots import Shots
 from emgs_jax.structure.store import make_models, models_of
 
+WAITING_S = 0.3  # between images of a camera before the structure begins
 ESTIMATED = "structure"  # in a data set's calibration: key of the structure that its camera is from
 
 
@@ -41,14 +43,16 @@ def structure_of(dataset: Dataset, config: StructureConfig, folder: Path | None)
 def follow_images(dataset: Dataset, config: StructureConfig) -> Callable[[int], Structure]:
     """Return a function that gives the structure of the images so far, once that of this number has come.
 
-    It takes more images only as long as no structure has begun.
+    It takes more images as long as no structure has begun; of a camera only those that show something new, as each is
+    mapped then. While those that waited are asked for, it takes one for every second of them: so it does not lose a
+    camera that moves on.
     """
     read, size, intrinsics = full_images(dataset)
     model, parameters = pinhole_of(intrinsics, config)
     camera = load().Camera(model=model, width=size[0], height=size[1], params=parameters, camera_id=CAMERA)
     camera.has_prior_focal_length = True
     mask = getattr(dataset, "full_mask", None) or (lambda index: None)
-    online, known = Online(camera, config), {}
+    online, known, begun = Online(camera, config), {}, []
 
     def image_of(index: int) -> np.ndarray | None:
         try:
@@ -56,10 +60,24 @@ def follow_images(dataset: Dataset, config: StructureConfig) -> Callable[[int], 
         except BadFrameError:
             return None
 
+    def take() -> bool:
+        """Add the next image; False if there is none."""
+        index = online.num_frames
+        if not dataset.has(index):
+            return False
+        add(online, image_of(index), mask(index))
+        return True
+
     def up_to(frame: int) -> Structure:
-        while (online.num_frames <= frame or not online.has_begun) and dataset.has(online.num_frames):
-            index = online.num_frames
-            add(online, image_of(index), mask(index))
+        while not online.has_begun and take():
+            if not online.has_begun and dataset.total is None:
+                if forget_follower(online):
+                    dataset.drop_last()
+                time.sleep(WAITING_S)
+        if not begun:
+            begun.append(online.num_frames)
+        while online.num_frames < max(frame + 1, begun[0] + frame // 2) and take():
+            pass
         if online.num_frames not in known:
             known.clear()
             known[online.num_frames] = newest(online)

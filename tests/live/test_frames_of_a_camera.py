@@ -1,5 +1,6 @@
 """Frames of a camera: sources that a test controls, against what they gave."""
 
+import os
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -15,7 +16,7 @@ from emgs_jax.data.intrinsics import Pictures, find_lens
 from emgs_jax.data.readable import ReadableFrames
 from emgs_jax.live import camera, capture
 from emgs_jax.live.camera import Camera
-from emgs_jax.live.newest import Newest, Shot, end_all
+from emgs_jax.live.newest import Newest, Shot, all_closed, end_all
 
 INTRINSICS = (40.0, 40.0, 15.5, 11.5)
 
@@ -102,6 +103,18 @@ def test_only_the_image_that_is_taken_is_read_and_one_that_is_damaged_is_passed_
     shot = newest.take(1.0)
     assert shot.time == 4.0 and read == [1, 4] and newest.num_dropped == 3 and newest.problem is None
     assert before <= shot.arrived <= came, "when it came, not when it was read"
+
+
+def test_an_error_ends_the_thread_that_waits_for_images(tmp_path):
+    """Also that of a recording whose images nobody has asked for."""
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{0.1 * number:.6f}.png"), an_image(number))
+    named = f"camera {tmp_path}"
+    with pytest.raises(ValueError, match="an error"), all_closed():
+        Camera(source=str(tmp_path), intrinsics=INTRINSICS)
+        assert named in {thread.name for thread in threading.enumerate()}
+        raise ValueError("an error")
+    assert named not in {thread.name for thread in threading.enumerate()}
 
 
 def test_a_recorded_image_that_cannot_be_read_ends_the_recording(tmp_path):
@@ -362,7 +375,7 @@ def test_depth_that_cannot_be_straightened_with_its_image_is_refused(source, int
 def test_a_full_disk_ends_the_camera_and_not_the_run(source, monkeypatch):
     source.give(Shot(0.0, an_image(0)))
     frames = Camera(source="0", intrinsics=INTRINSICS)
-    monkeypatch.setattr(camera, "atomic_write", lambda path: (_ for _ in ()).throw(OSError("no space left")))
+    monkeypatch.setattr(camera, "atomic_write", lambda path, **_: (_ for _ in ()).throw(OSError("no space left")))
     source.give(Shot(1.0, an_image(1)))
     assert not frames.has(1) and frames._newest.reason == "no space left" and frames.total == 1
 
@@ -381,6 +394,46 @@ def test_a_clock_that_is_set_back_keeps_the_order(source):
     frames = Camera(source="0", intrinsics=INTRINSICS)
     source.give(Shot(9.0, an_image(1)), None)
     assert wait_for_all(frames) == 2 and frames[1].timestamp > frames[0].timestamp
+
+
+def test_the_last_image_is_not_read_again_and_is_as_it_is_on_the_disk(source, monkeypatch):
+    drawn = np.random.default_rng(0).integers(0, 256, (24, 32, 3), np.uint8)
+    source.give(Shot(0.0, drawn))
+    frames = Camera(source="0", intrinsics=INTRINSICS, size=(32, 24))
+    with monkeypatch.context() as patch:
+        patch.setattr("emgs_jax.data.straightened.read_shown", lambda *_: pytest.fail("it is read"))
+        last = frames[0].image
+    source.give(Shot(1.0, an_image(1)))
+    assert frames.has(1)
+    np.testing.assert_array_equal(last, drawn)
+    np.testing.assert_array_equal(frames[0].image, drawn)
+
+
+@pytest.mark.parametrize("record", [False, True])
+def test_only_a_recording_waits_for_the_disk(source, tmp_path, monkeypatch, record):
+    """Symptom: a tenth of the time went to make images outlive a power cut that are deleted when the run ends."""
+    synced = []
+    monkeypatch.setattr(os, "fsync", synced.append)
+    source.give(Shot(0.0, an_image(0), {"depth": np.ones((24, 32), np.float32)}))
+    Camera(source="0", intrinsics=INTRINSICS, record=record, folder=tmp_path)
+    assert len(synced) == (2 if record else 0)
+
+
+def test_the_last_frame_can_be_left_out_as_if_it_had_not_come(source):
+    given = {"depth": np.ones((24, 32), np.float32)}
+    source.give(Shot(0.0, an_image(0)))
+    camera = Camera(source="0", intrinsics=INTRINSICS, size=(32, 24))
+    frames = ReadableFrames(camera)
+    source.give(Shot(0.1, an_image(1), given))
+    assert frames.has(1) and frames[1].image[0, 0, 0] == 1
+    path = camera.files(1)[0]
+    num_dropped = camera._newest.num_dropped
+    frames.drop_last()
+    assert len(frames) == 1 and not path.exists() and not path.with_suffix(".npz").exists()
+    source.give(Shot(0.2, an_image(2)))
+    assert frames.has(1) and len(frames) == 2
+    assert frames[1].image[0, 0, 0] == 2 and frames[1].timestamp == 0.2 and frames[0].image[0, 0, 0] == 0
+    assert camera._newest.num_dropped == num_dropped + 1
 
 
 def test_images_that_are_not_recorded_are_deleted(source):

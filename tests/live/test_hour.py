@@ -42,6 +42,8 @@ def test_the_memory_of_an_hour_is_that_of_ten_minutes(tmp_path, monkeypatch):
     def watched(*words):
         for found in original(*words):
             memory.extend([int(Path("/proc/self/statm").read_text().split()[1]) / 256] * len(found[1]))
+            if len(memory) % 1000 == 0:
+                print(f"{max(memory):.0f} MiB after {len(memory)} frames", flush=True)
             yield found
 
     monkeypatch.setattr(capture, "open_source", to_and_fro)

@@ -88,3 +88,22 @@ def test_depths_in_another_unit_end_the_run_however_long_the_camera_stands_still
 def test_poses_in_another_convention_are_named(tmp_path):
     with pytest.raises(ValueError, match="the poses are taken as world -> camera"):
         asked(Beside(tmp_path, lambda row, depth, pose: (depth, np.linalg.inv(pose)), room=walk()))
+
+
+def scaled(*factors: float):
+    """Depths of views with factors of their own, and poses as they are."""
+    return lambda row, depth, pose: (np.float32(factors[row]) * depth, pose)
+
+
+def test_a_stream_is_not_refused_for_the_chance_of_its_first_views(tmp_path, capsys):
+    """Symptom: one of five runs of the same bag ended after two frames, by which two had come."""
+    assert len(asked(Beside(tmp_path, scaled(1.0, 1.3, 1.0, 1.0, 1.0, 1.0), room=walk()))) == 6
+    assert "two views differ by 2" in capsys.readouterr().out, "it is said"
+
+
+def test_depths_that_do_not_fit_over_several_views_end_the_run(tmp_path):
+    """As of a network that sees one image at a time."""
+    change = scaled(1.0, 1.3, 0.9, 1.2, 0.8, 1.1)
+    with pytest.raises(ValueError, match=r"differ by [23]\d\.\d %, by \d\.\d % where each view has a scale of its own"):
+        asked(Beside(tmp_path, change, room=walk()))
+    assert len(asked(Beside(tmp_path, change, room=walk()), max_misfit=1.0)) == 6

@@ -134,6 +134,25 @@ def test_what_was_saved_outlives_the_node_and_the_publisher(tmp_path, shared_mem
     np.testing.assert_array_equal(read_run(out / "saved-1").poses, saved.poses)
 
 
+@pytest.mark.slow
+def test_an_error_ends_the_node_by_one_line(tmp_path, shared_memory):
+    """Symptom: "terminate called without an active exception", and an abort, as the thread of rclpy still ran."""
+    words = *TOPICS[:2], "prior=stream", "dataset.size=[64,48]", *OF_ROOM, f"hydra.run.dir={tmp_path / 'run'}"
+    publisher = published(tmp_path)
+    try:
+        found = subprocess.run(
+            [sys.executable, "-m", "experiments.ros", *words],
+            cwd=Path(__file__).parents[2],
+            capture_output=True,
+            text=True,
+            timeout=600,
+        )
+    finally:
+        publisher.kill()
+    assert found.returncode == 1, found.stderr
+    assert found.stderr.count("error: ") == 1 and "is not beside" in found.stderr and "terminate" not in found.stderr
+
+
 def published(folder: Path, fps: float = 30.0) -> subprocess.Popen:
     """A publisher of the tiny room's frames with depth and odometry, over and over."""
     recorded = folder / "played"
@@ -209,8 +228,12 @@ INVERSE_DEPTH = 1.15496, 0.26901  # of the network's values v: 1 / z = a v + b
 
 @pytest.mark.weekly
 @pytest.mark.skipif(not DESK.is_dir(), reason="FR1_DESK is no folder of TUM fr1/desk with depths")
-def test_a_bag_of_fr1_desk_is_played_in_real_time_into_the_node(tmp_path, shared_memory):
-    """30 images a second, poses by motion capture; the test prints what docs/measurements/live.md has."""
+def test_a_bag_of_fr1_desk_is_played_in_real_time_into_the_node(tmp_path, shared_memory, monkeypatch):
+    """30 images a second, poses by motion capture; the test prints what docs/measurements/live.md has.
+
+    The node compiles as a robot's does: the flags of the tests, which compile quickly, make it three times as slow.
+    """
+    monkeypatch.delenv("XLA_FLAGS")
     pytest.importorskip("rosbags", reason="bags: pip install -e .[rosbag]")
     import ros_bag
 
@@ -235,7 +258,7 @@ def test_a_bag_of_fr1_desk_is_played_in_real_time_into_the_node(tmp_path, shared
     delays, rate = np.array(heard.delays[1:-1]), metrics["camera/frames_per_second"]
     late = f"{np.median(delays):.2f} s behind, 95 % within {np.quantile(delays, 0.95):.2f} s"
     print(f"{count} maps, {rate:.2f} a second; {metrics['camera/num_dropped']:.0f} dropped; the cloud {late}")
-    assert metrics["frames/lost"] == 0 and rate >= 1 and np.median(delays) < 3
+    assert metrics["frames/lost"] == 0 and rate >= 2 and np.median(delays) < 1
     path = np.array([[p.pose.position.x, p.pose.position.y, p.pose.position.z] for p in heard.path.poses])
     truth = np.array([T[:3, 3] for _, _, T in frames])
     assert np.median(np.linalg.norm(path[:, None] - truth, axis=2).min(1)) < 0.03

@@ -16,18 +16,26 @@ NOISE = np.random.default_rng(0).integers(0, 255, (120, 160, 3), np.uint8)
 
 
 class Coming(Synthetic):
-    """The built-in room; some frames come twice, or show something else."""
+    """The built-in room; some frames come twice, or show something else. A camera's can be dropped."""
 
-    def __init__(self, count: int = 12, order=None, others=None) -> None:
+    def __init__(self, count: int = 12, order=None, others=None, is_camera: bool = False) -> None:
         super().__init__(num_frames=40, stop=count, size=(160, 120))
         self.order, self.others = [*(order or range(count))], others or {}
         self.taken: list[int] = []
+        self._is_camera = is_camera
 
     def __len__(self) -> int:
         return len(self.order)
 
     def has(self, index: int) -> bool:
         return index < len(self.order)
+
+    @property
+    def total(self) -> int | None:
+        return None if self._is_camera else len(self.order)
+
+    def drop_last(self) -> None:
+        del self.order[self.taken[-1]]
 
     def __getitem__(self, index: int) -> Frame:
         self.taken.append(index)
@@ -82,7 +90,7 @@ def test_no_image_is_asked_for_that_is_not_needed_and_those_before_the_beginning
     begun = found[0][1]  # the first structure waits for parallax
     assert 2 <= begun < 13
     assert found[0][0].is_placed[: begun + 1].all()
-    assert [taken for _, taken in found] == [max(begun, frame) for frame in range(14)]
+    assert [taken for _, taken in found] == [min(max(begun + frame // 2, frame), 13) for frame in range(14)]
 
 
 def test_the_unit_and_the_focal_length_stay():
@@ -110,8 +118,9 @@ def test_motions_err_as_their_covariances_say():
 
 
 def test_the_same_images_give_the_same_bits():
+    """Without a number of threads, too."""
     _, found = whole()
-    again = followed(Coming(14))
+    again = followed(Coming(14), "prior.structure.num_threads=-1")
     for frame in range(14):
         other = again(frame)
     for name in ("T_world_camera", "covariance"):
@@ -127,6 +136,22 @@ def test_a_camera_that_stands_still_has_no_keyframes_but_poses():
     assert np.abs(still - still[0]).max() < 1e-3 * 2.0  # of the depth
     alone = followed(Coming(order=[0] * 5))(4)
     assert not alone.is_placed.any()  # without parallax there is nothing
+
+
+def test_a_camera_that_stands_still_at_first_leaves_no_frames_to_catch_up_with(monkeypatch):
+    """Symptom: twenty of them were mapped for 23 s, in which no image was taken, and the camera was lost after that."""
+    monkeypatch.setattr("emgs_jax.structure.sequence.WAITING_S", 0.0)
+    dataset = Coming(order=[0] * 6 + [*range(12)], is_camera=True)
+    live = followed(dataset)
+    for frame in range(12):
+        found = live(min(frame, len(dataset) - 1))
+    kept = dataset.order[: len(found.world)]
+    assert kept[0] == 0 and kept.count(0) == 1 and found.is_placed.all()
+    recorded = Coming(order=kept)  # what was kept gives the same structure
+    again = followed(recorded)
+    for frame in range(len(kept)):
+        last = again(frame)
+    np.testing.assert_array_equal(last.T_world_camera, found.T_world_camera)
 
 
 def test_a_camera_that_is_lost_comes_back():

@@ -24,11 +24,18 @@ NUM_PAIRS, GAP = 4, 4  # of frames, and frames between them
 
 
 class Sight(NamedTuple):
-    """A view: camera-frame points, usable pixels and pose."""
+    """A view, or some pixels of it: camera-frame points, usable pixels and pose."""
 
-    points: Float[np.ndarray, "h w 3"]
-    mask: Bool[np.ndarray, "h w"]
+    points: Float[np.ndarray, "*pixels 3"]
+    mask: Bool[np.ndarray, "*pixels"]
     T_world_camera: Float[np.ndarray, "4 4"]
+
+
+Read = Callable[[Sight], Sight]  # converts each pixel by itself, and the pose
+
+
+def as_it_is(sight: Sight) -> Sight:
+    return sight
 
 
 def check_conventions(
@@ -40,17 +47,19 @@ def check_conventions(
         ValueError: they differ by more than `max_misfit`, or fit much better in another convention or unit.
     """
     pairs = [*pairs]
-    own = median_misfit(pairs, intrinsics, lambda sight: sight)
+    own = median_misfit(pairs, intrinsics)
     words = f"the depths of two views differ by {100 * own:.1f} %{' (they share nothing)' if np.isinf(own) else ''}"
     if not own > MAX_MISFIT:
         return words
     found = {words: median_misfit(pairs, intrinsics, read) for words, read in _readings().items()}
+    turned = [(_mirrored(a), _mirrored(b)) for a, b in pairs]
+    found["the depths are mirrored, left for right"] = median_misfit(turned, intrinsics)
     best = min(found, key=lambda words: found[words])
     closest = f"by {100 * found[best]:.1f} % where {best}"
     expected = f"expected are {EXPECTED}, depths along z, and one unit for poses and depths"
     if found[best] < min(own / MIN_GAIN, GOOD_MISFIT):
         raise ValueError(f"{source}: {words}, and {closest}: {expected}")
-    rest = median_misfit(pairs, intrinsics, lambda sight: sight, has_own_scales=True)
+    rest = median_misfit(pairs, intrinsics, has_own_scales=True)
     rest = f"by {100 * rest:.1f} % where each view has a scale of its own"
     if own > max_misfit:
         raise ValueError(
@@ -64,26 +73,25 @@ def check_conventions(
 def median_misfit(
     pairs: Sequence[tuple[Sight, Sight]],
     intrinsics: Sequence[float],
-    read: Callable[[Sight], Sight],
+    read: Read = as_it_is,
     has_own_scales: bool = False,
 ) -> float:
     """Median `misfit` of the pairs after `read`; 0 without any."""
-    with np.errstate(divide="ignore", invalid="ignore"):  # where there is no depth
-        sights = [(read(a), read(b)) for a, b in pairs]
-    moved = [(a, b, np.linalg.inv(a.T_world_camera) @ b.T_world_camera) for a, b in sights]
-    found = [misfit(*pair, intrinsics, has_own_scales) for pair in moved]
+    found = [misfit(a, b, intrinsics, read, has_own_scales) for a, b in pairs]
     return float(np.median(found)) if found else 0.0
 
 
 def misfit(
-    a: Sight, b: Sight, T_a_b: Float[np.ndarray, "4 4"], intrinsics: Sequence[float], has_own_scales: bool = False
+    a: Sight, b: Sight, intrinsics: Sequence[float], read: Read = as_it_is, has_own_scales: bool = False
 ) -> float:
-    """Median of |log of the ratio| of the depths of b's points in a and a's own; inf for too few.
+    """Median of |log of the ratio| of the depths of b's points in a and a's own, after `read`; inf for too few.
 
     With `has_own_scales` the median of the log is subtracted first.
     """
     fx, fy, cx, cy = intrinsics
-    points = b.points[::STEP, ::STEP][b.mask[::STEP, ::STEP]] @ T_a_b[:3, :3].T + T_a_b[:3, 3]
+    b = read(_chosen(b, (slice(None, None, STEP), slice(None, None, STEP))))
+    T_a_b = np.linalg.inv(read(_chosen(a, (slice(0), slice(0)))).T_world_camera) @ b.T_world_camera
+    points = b.points @ T_a_b[:3, :3].T + T_a_b[:3, 3]
     points = points[points[:, 2] > 0]
     u = np.rint(fx * points[:, 0] / points[:, 2] + cx)
     v = np.rint(fy * points[:, 1] / points[:, 2] + cy)
@@ -93,21 +101,26 @@ def misfit(
     known = a.mask[rows, columns]
     if known.sum() < MIN_SHARED:
         return np.inf
-    ratios = points[inside, 2][known] / a.points[rows, columns, 2][known]
+    ratios = points[inside, 2][known] / read(_chosen(a, (rows, columns))).points[:, 2]
     logs = np.log(ratios[ratios > 0])  # a reading may have put points behind the camera
     if len(logs) < MIN_SHARED:
         return np.inf
     return float(np.median(np.abs(logs - np.median(logs) if has_own_scales else logs)))
 
 
-def _readings() -> dict[str, Callable[[Sight], Sight]]:
+def _chosen(sight: Sight, pixels: tuple) -> Sight:
+    """The usable ones of some pixels of a view."""
+    mask = sight.mask[pixels]
+    return Sight(sight.points[pixels][mask], mask[mask], sight.T_world_camera)
+
+
+def _readings() -> dict[str, Read]:
     """Functions that convert a sight to other conventions, by description."""
-    found: dict[str, Callable[[Sight], Sight]] = {
+    found: dict[str, Read] = {
         f"the poses are taken as {words}": partial(_posed, change=change) for words, change in READINGS.items()
     }
     found["the depths are taken as lengths of the rays"] = lambda sight: times(sight, 1 / _stretch(sight.points))
     found["the points are taken as those of the world"] = _in_camera
-    found["the depths are mirrored, left for right"] = _mirrored
     for factor in FACTORS:
         if abs(np.log(factor)) > np.log(MIN_FACTOR):
             found[f"the depths are multiplied by about {factor:.4g}, or the positions by {1 / factor:.4g}"] = partial(
@@ -129,11 +142,12 @@ def _in_camera(sight: Sight) -> Sight:
 def _mirrored(sight: Sight) -> Sight:
     """Mirror the depths, left for right."""
     depth = sight.points[..., 2]
-    rays = sight.points / np.where(depth > 0, depth, 1)[..., None]
-    return Sight(rays * depth[:, ::-1, None], sight.mask & sight.mask[:, ::-1], sight.T_world_camera)
+    with np.errstate(invalid="ignore"):  # where there is no depth
+        points = sight.points / np.where(depth > 0, depth, 1)[..., None] * depth[:, ::-1, None]
+    return Sight(points, sight.mask & sight.mask[:, ::-1], sight.T_world_camera)
 
 
-def times(sight: Sight, factor: float | Float[np.ndarray, "h w"]) -> Sight:
+def times(sight: Sight, factor: float | Float[np.ndarray, "*pixels"]) -> Sight:
     """Multiply the depths by a factor, for all or for each pixel."""
     return sight._replace(points=sight.points * np.asarray(factor)[..., None])
 
@@ -143,7 +157,7 @@ def _inverse(sight: Sight, factor: float) -> Sight:
     return times(sight, factor / np.square(sight.points[..., 2]))
 
 
-def _stretch(points: Float[np.ndarray, "h w 3"]) -> Float[np.ndarray, "h w"]:
+def _stretch(points: Float[np.ndarray, "*pixels 3"]) -> Float[np.ndarray, "*pixels"]:
     """Length of the ray to each point over its depth."""
     return np.linalg.norm(points, axis=-1) / points[..., 2]
 

@@ -137,10 +137,10 @@ class Files(Prior):
         except ValueError as error:
             raise ValueError(f"{error}{_turned_note(turned)}") from error
         pairs = self._pairs(known, camera)
-        misfit = median_misfit(pairs, dataset.intrinsics, lambda sight: sight)
+        misfit = median_misfit(pairs, dataset.intrinsics)
         if not np.isfinite(misfit):  # the camera turns fast
             pairs = self._pairs(known, camera, gap=1) or pairs
-            misfit = median_misfit(pairs, dataset.intrinsics, lambda sight: sight)
+            misfit = median_misfit(pairs, dataset.intrinsics)
         fit = check_conventions(pairs, dataset.intrinsics, found.pose_source, self._max_misfit)
         if angle is not None and angle > TURNED and misfit < FITS:
             fit += (

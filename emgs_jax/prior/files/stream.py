@@ -24,11 +24,14 @@ from emgs_jax.prior.base import (
     predicted,
     relative_poses,
 )
-from emgs_jax.prior.files.conventions import Sight, check_conventions
+from emgs_jax.prior.files.conventions import Sight, check_conventions, median_misfit
 from emgs_jax.prior.files.own import own_pose, read_npz_view
 from emgs_jax.prior.files.view import Camera, at_frame, whole_image
 
-NUM_COMPARED, MOVED = 3, 0.05  # views that are compared; from one to the next: radians, or a share of the depth
+# Pairs of views that show another convention or unit, and those that show how well depths fit: as many as of files.
+NUM_CLEAR, NUM_PAIRS = 2, 5
+MOVED = 0.05  # from one of these views to the next: radians, or a share of the depth
+SOURCE = "T_world_camera of the stream"
 
 
 class Stream(Prior):
@@ -37,7 +40,7 @@ class Stream(Prior):
     Args:
         max_depth_step: relative depth difference across which nothing is interpolated.
         pose_std: of every pose, (metres, degrees); None: the map finds out.
-        max_misfit: largest median difference of the depths of two of the first views.
+        max_misfit: largest median difference of the depths of two views, of the first `NUM_PAIRS`.
     """
 
     def __init__(
@@ -92,7 +95,10 @@ class Stream(Prior):
         return at_frame(read_npz_view(path), camera, whole_image, self._max_depth_step)
 
     def _check_conventions(self, window: Window, pose: np.ndarray, camera: Camera) -> None:
-        """Compare the first views with a pose that has moved from one to the next, once there are enough."""
+        """Compare the first views with a pose that has moved from one to the next, once there are enough.
+
+        Two alone would end a run by chance: depths of a network vary.
+        """
         points, _, mask = self._points[window.current]
         if not np.isfinite(pose).all() or not mask.any():
             return
@@ -102,10 +108,12 @@ class Stream(Prior):
             if np.linalg.norm(step[:3, 3]) < MOVED * np.median(points[..., 2][mask]) and angle < MOVED:
                 return
         self._first = [*self._first, Sight(points, mask, pose)]
-        if len(self._first) == NUM_COMPARED:
-            pairs = [*itertools.pairwise(self._first)]
-            fit = check_conventions(pairs, camera.intrinsics, "T_world_camera of the stream", self._max_misfit)
-            tqdm.write(f"prior=stream: {fit}")
+        pairs, intrinsics = [*itertools.pairwise(self._first)], camera.intrinsics
+        if len(pairs) == NUM_CLEAR:
+            tqdm.write(f"prior=stream: {check_conventions(pairs, intrinsics, SOURCE, np.inf)}")
+        if len(pairs) == NUM_PAIRS:
+            if median_misfit(pairs, intrinsics) > self._max_misfit:
+                check_conventions(pairs, intrinsics, SOURCE, self._max_misfit)  # raises
             self._first = None
 
 

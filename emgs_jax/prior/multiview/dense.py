@@ -53,6 +53,7 @@ class Way:
     # The frames' depths, and the scale of each world by depths in metres, None where they say nothing.
     begin: Callable[[Scene], tuple[Depths, Sequence[Scale | None]]]
     check: Callable[[Dataset], None] = lambda dataset: None  # raises ValueError if it does not fit a data set
+    rehearse: Callable[[Camera], None] = lambda camera: None  # compiles its programs, before images come
     needs_all: bool = False  # one fit to all frames, which an online structure does not have
     contents: Mapping[str, Any] = field(default_factory=dict)  # digest of its files, for provenance
 

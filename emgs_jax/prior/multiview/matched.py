@@ -15,7 +15,7 @@ from emgs_jax.ops.ranges import number
 from emgs_jax.prior.multiview.dense import DenseConfig, Depth, Depths, Scene, tried_depths
 from emgs_jax.prior.multiview.depth import pixels_per_log_depth
 from emgs_jax.prior.multiview.lens import Lens
-from emgs_jax.prior.sources import Sources, choose, parallax, placed_beside, sources_of
+from emgs_jax.prior.sources import Sources, choose, parallax, placed_beside, same_sources, sources_of
 from emgs_jax.scale.estimate import Scale
 from emgs_jax.structure.model import Structure
 
@@ -38,6 +38,15 @@ class Stereo(NamedTuple):
     # The view, its sources, nearest and farthest depth to try, camera -> depth (h, w), 0 where unknown, and its spread,
     # proportional to the standard deviation of log z.
     estimate: Callable[[Any, Sources, Float[Array, "2"], Camera], tuple[np.ndarray, np.ndarray]]
+
+
+def rehearse(camera: Camera, stereo: Stereo, config: MatchedConfig) -> None:
+    """Compile the programs of `begin_matched`."""
+    blank = np.zeros((camera.height, camera.width, 3), np.uint8)
+    view = stereo.prepare(blank, Lens(camera.focal, camera.center))
+    sources, depth_range = same_sources(view, config.num_sources), jnp.asarray(tried_depths(np.ones(1), 2.0))
+    depth, _ = stereo.estimate(view, sources, depth_range, camera)
+    jitted_pixels(jnp.asarray(depth), sources._replace(views=None), camera)
 
 
 def begin_matched(scene: Scene, stereo: Stereo, config: MatchedConfig) -> tuple[Depths, Sequence[Scale]]:

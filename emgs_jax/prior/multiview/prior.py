@@ -31,10 +31,10 @@ from emgs_jax.prior.multiview.depth_files import DepthFilesConfig, way_of_files
 from emgs_jax.prior.multiview.depth_noise import relative_std
 from emgs_jax.prior.multiview.learned import LearnedConfig, learned
 from emgs_jax.prior.multiview.lens import Lens, as_shown, lens_of, points_shown
-from emgs_jax.prior.multiview.matched import begin_matched
+from emgs_jax.prior.multiview.matched import begin_matched, rehearse
 from emgs_jax.prior.multiview.monocular_network import MeterConfig, way_of_meter
 from emgs_jax.prior.multiview.swept import SweptConfig, swept
-from emgs_jax.prior.sources import placed_beside, sources_of
+from emgs_jax.prior.sources import Sources, placed_beside, same_sources, sources_of
 from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.metres import ScaleConfig, View, metres_of
 from emgs_jax.structure.config import StructureConfig
@@ -54,7 +54,8 @@ def way_of(config: AnyDense) -> Way:
     if isinstance(config, MeterConfig):
         return way_of_meter(config)
     stereo = learned(config) if isinstance(config, LearnedConfig) else swept(config)
-    return Way(partial(begin_matched, stereo=stereo, config=config))
+    of_stereo = {"stereo": stereo, "config": config}
+    return Way(partial(begin_matched, **of_stereo), rehearse=partial(rehearse, **of_stereo))
 
 
 def _described(config: AnyDense, way: Way) -> dict:
@@ -116,10 +117,19 @@ class MultiviewStereo(Prior):
         self._dataset = dataset
 
     def keep(self, folder: Path) -> None:
-        """Make the structure in `folder`/structure, or load it from there; an online one begins with the first call."""
+        """Make the structure in `folder`/structure, or load it from there.
+
+        An online one begins with the first call. Programs are compiled here, before images pass.
+        """
         self._folder = folder / "structure"
         if not self._config.online:
             self._take(0)
+            return
+        self._open()
+        self._way.rehearse(self._camera)
+        nothing = np.zeros((self._camera.height, self._camera.width), np.float32)
+        if self._dense.num_checks:
+            self._difference(nothing, same_sources(jnp.asarray(nothing), self._dense.num_checks))
 
     def report(self) -> dict[str, float]:
         """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models.
@@ -183,20 +193,25 @@ class MultiviewStereo(Prior):
 
     def _take(self, frame: int) -> Structure:
         """The structure of the images up to this one, or of more."""
-        if self._dataset is None:
-            raise ValueError("multiview_stereo makes a structure of a data set: call check(dataset, window_size) first")
         if self._up_to is None:
-            (width, height), intrinsics = self._dataset.size, self._dataset.intrinsics
-            self._camera = Camera(np.float32(intrinsics[:2]), np.float32(intrinsics[2:]), width, height)
-            self._up_to, self._is_straight = self._begin()
-            self._known = self._up_to(frame)
-            self._newest = lambda: self._known
-            depths, scales = self._way.begin(Scene(self._dataset, self._newest, self._lens, self._camera))
-            self._depths = lru_cache(NUM_KEPT)(depths)  # a frame's neighbours ask for its depth again
-            if self._metres.is_given or any(scales):
-                self._to_metres(self._newest(), scales)
+            self._open()
         self._known = self._up_to(frame)
         return self._newest()
+
+    def _open(self) -> None:
+        """Make the structure and begin the depths; online no image is taken yet."""
+        if self._dataset is None:
+            raise ValueError("multiview_stereo makes a structure of a data set: call check(dataset, window_size) first")
+        (width, height), intrinsics = self._dataset.size, self._dataset.intrinsics
+        self._camera = Camera(np.float32(intrinsics[:2]), np.float32(intrinsics[2:]), width, height)
+        self._up_to, self._is_straight = self._begin()
+        if not self._config.online:
+            self._known = self._up_to(0)
+        self._newest = lambda: self._known
+        depths, scales = self._way.begin(Scene(self._dataset, self._newest, self._lens, self._camera))
+        self._depths = lru_cache(NUM_KEPT)(depths)  # a frame's neighbours ask for its depth again
+        if self._metres.is_given or any(scales):
+            self._to_metres(self._newest(), scales)
 
     def _begin(self) -> tuple[Callable[[int], Structure], bool]:
         """A function that gives the newest structure, see `_take`, and True if its images are undistorted."""
@@ -275,5 +290,8 @@ class MultiviewStereo(Prior):
         if not others:
             return np.full_like(depth, np.inf)
         seen = sources_of(found, frame, others, config.num_checks, lambda other: jnp.asarray(depths(other).depth))
-        difference = jitted_difference(jnp.asarray(depth), seen, self._camera, jnp.float32(config.depth_step))
-        return relative_std(pixels, spread, np.asarray(difference), config.noise)
+        return relative_std(pixels, spread, self._difference(depth, seen), config.noise)
+
+    def _difference(self, depth: np.ndarray, seen: Sources) -> np.ndarray:
+        step = jnp.float32(self._dense.depth_step)
+        return np.asarray(jitted_difference(jnp.asarray(depth), seen, self._camera, step))

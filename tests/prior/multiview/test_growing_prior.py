@@ -5,6 +5,7 @@ from functools import cache
 import numpy as np
 import pytest
 from hydra.errors import InstantiationException
+from listening import compiled
 from scene import compose
 
 from emgs_jax.config.configure import build
@@ -43,9 +44,23 @@ def test_each_frame_is_predicted_when_it_comes_without_later_ones():
     found, _, prior = predicted()
     begun = found[0][1]
     assert [one.window.current for one, _ in found] == [*range(COUNT)] and 2 <= begun < COUNT - 1
-    assert [taken for _, taken in found] == [max(begun, frame) for frame in range(COUNT)]
+    wanted = [max(begun + frame // 2, frame) for frame in range(COUNT)]  # those that waited do not lose the camera
+    assert [taken for _, taken in found] == [min(frame, COUNT - 1) for frame in wanted]
     assert prior.adjusts_poses
     assert prior.report()["prior/placed_percent"] == 100 and prior.provenance.settings["structure"]["online"]
+
+
+@pytest.mark.slow
+def test_nothing_is_compiled_after_the_images_have_begun(tmp_path):
+    """Symptom: the first map came seconds after the structure had begun, in which the camera moved on."""
+    dataset, prior = Synthetic(num_frames=40, stop=COUNT, size=(136, 104)), build(compose(*WORDS), "prior")
+    prior.check(dataset, 4)
+    with compiled() as before:
+        prior.keep(tmp_path)
+    with compiled() as names:
+        for window, frames in with_frames(calls_of(prior, dataset, 4), dataset):
+            prior.predict(window, list(frames.values()), dataset.intrinsics)
+    assert "estimate_depth" in before and not names
 
 
 @pytest.mark.slow
