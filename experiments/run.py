@@ -29,6 +29,7 @@ from emgs_jax.mapping.records import FrameRecord, show_records, to_line
 from emgs_jax.mapping.run import MappingRun, check_settings, new_run
 from emgs_jax.mapping.window_input import RawView
 from emgs_jax.prior.base import UP_KEYS, Prior
+from emgs_jax.render.densify import DensifyConfig
 from emgs_jax.report.page import write_report
 from emgs_jax.report.printout import frame_lines, last_words, metrics_table, polish_lines, time_words, why_no_errors
 from emgs_jax.runs.back_end import revisit_note
@@ -129,25 +130,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         if is_live:  # all its frames are known now
             origin["data"] = described(dataset)
         origin["config"] |= {"dataset": dataset.recording() or settings["dataset"]}
-        # The raw prior is scored while the map is drawn and written.
-        with ThreadPoolExecutor(2, "raw prior") as threads:
-            truth = threads.submit(new_scorer, dataset, evaluation, prior)
-            of_prior = threads.submit(lambda: score_prior(session, raw, truth.result()))
-            with clock.phase("export"):
-                save_progress(folder, session)
-            with _said(clock, "densify", "drawing the map from the pose of every frame"):
-                labelled = labelled_map(session, prior)
-                dense = dense_map(session, dataset, densify, evaluation, labelled, own=raw.points)
-            with _said(clock, "export", "writing the map, its points, a mesh and the overview"):
-                title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
-                unit = "m" if is_metric(prior.provenance.settings) else "units"
-                notes = save_outputs(folder, session, dense, densify, title, evaluation.alignment == "sim3", unit)
-                save_classes(folder, prior)
-            compared = ", ".join(["the map", "the raw prior", *fused]) if dataset.has_ground_truth else ""
-            with _said(clock, "evaluate", compared and f"comparing with the truth: {compared}"):
-                scorer, labels = truth.result(), None if labelled is None else labelled.centers
-                metrics = score_map(session, dense.cloud, center_cloud(session), labels, scorer) | dense.rendering
-                metrics |= of_prior.result() | score_baselines(session, baselines, raw, scorer)
+        compared = [*fused] if dataset.has_ground_truth else None
+        metrics, notes = _write(session, raw, dataset, prior, baselines, compared, (evaluation, densify), folder)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
         metrics |= dataset.report()
         metrics |= scale_off(metrics)
@@ -157,8 +141,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     with clock.phase("report"):
         finished = read_run(folder)
     if fitting is not None:
-        tqdm.write("fitting splats to the images …")
-        with clock.phase("polish"):
+        with _said(clock, "polish", "fitting splats to the images"):
             try:
                 notes = [*notes, *polish_lines(polish(finished, dataset, fitting, densify))]
             except ValueError as error:  # the run itself is finished
@@ -232,6 +215,45 @@ def _map(
     if live is not None:
         live.show_last(run)
     return run, raw
+
+
+def _write(
+    run: MappingRun,
+    raw: RawPrior,
+    dataset: ReadableFrames,
+    prior: Prior,
+    baselines: Baselines,
+    compared: list[str] | None,
+    configs: tuple[EvaluationConfig, DensifyConfig],
+    folder: Path,
+) -> tuple[dict[str, Any], list[str]]:
+    """Draw the map, write it and compare it with the truth; the raw prior is scored meanwhile.
+
+    Args:
+        compared: names of the baselines; None without a truth.
+
+    Returns:
+        The metrics, and what is to be said of the files.
+    """
+    clock, (evaluation, densify) = run.clock, configs
+    with ThreadPoolExecutor(2, "raw prior") as threads:
+        truth = threads.submit(new_scorer, dataset, evaluation, prior)
+        of_prior = threads.submit(lambda: score_prior(run, raw, truth.result()))
+        with clock.phase("export"):
+            save_progress(folder, run)
+        with _said(clock, "densify", "drawing the map from the pose of every frame"):
+            labelled = labelled_map(run, prior)
+            dense = dense_map(run, dataset, densify, evaluation, labelled, own=raw.points)
+        with _said(clock, "export", "writing the map, its points, a mesh and the overview"):
+            title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
+            unit = "m" if is_metric(prior.provenance.settings) else "units"
+            notes = save_outputs(folder, run, dense, densify, title, evaluation.alignment == "sim3", unit)
+            save_classes(folder, prior)
+        words = "" if compared is None else ", ".join(["the map", "the raw prior", *compared])
+        with _said(clock, "evaluate", words and f"comparing with the truth: {words}"):
+            scorer, labels = truth.result(), None if labelled is None else labelled.centers
+            metrics = score_map(run, dense.cloud, center_cloud(run), labels, scorer) | dense.rendering
+            return metrics | of_prior.result() | score_baselines(run, baselines, raw, scorer), notes
 
 
 def run_and_print(config: DictConfig) -> float:
