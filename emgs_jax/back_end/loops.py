@@ -1,7 +1,6 @@
 """Loops: detect them by keyframes, verify them, query the prior, and check spatial consistency."""
 
 import math
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -42,7 +41,7 @@ def detect_loops_between(end: BackEnd, submap_id: int, is_one_walk: bool = False
     """Verify loops between the keyframes of a submap, whose unit may differ, and those of the active one.
 
     The submap's nodes come after those of the active one. If both are of one walk, these keyframes have the candidates
-    that they would have in one run, and no more: those that were tested before count.
+    that they would have in one run.
     """
     config, is_placed = end.config.place_recognition, [end.nodes[one.frame].is_placed for one in end.database.keyframes]
     known, queries = (
@@ -50,12 +49,8 @@ def detect_loops_between(end: BackEnd, submap_id: int, is_one_walk: bool = False
         for number in (end.active, submap_id)
     )
     if is_one_walk:
-        there, tested = {*known}, Counter(one.b for one in (*end.verified, *end.refusals))
-        left = (max(config.num_candidates - tested[end.database.keyframes[row].frame], 0) for row in queries)
-        proposed = (
-            [one for one in each if one in there][:most]
-            for each, most in zip(propose_for_all(end.database, queries, config), left, strict=True)
-        )
+        there = {*known}
+        proposed = ([one for one in each if one in there] for each in propose_for_all(end.database, queries, config))
     else:
         asked = (end.database.keyframes[row] for row in queries)
         proposed = (most_similar(end.database, one, known, config.num_candidates, config) for one in asked)

@@ -142,24 +142,26 @@ def merged(runs: Sequence[MergeableRun], has_truth: bool) -> Merged:
     """
     for other in runs[1:]:
         check_features(runs[0].finished, other.finished)
-    parts = joined_by_images([Part(run.atlas, [row], [*range(len(run.records))]) for row, run in enumerate(runs)], runs)
-    first, pending, reasons = parts[0], parts[1:], {}
+    atlas, order, pending, reasons = runs[0].atlas, [0], [*range(1, len(runs))], {}
+    images = [*range(len(runs[0].records))]  # the first row of the image of each
     while pending:
-        for part in pending:
-            found = joined(first, part, runs)
-            if isinstance(found, Part):
+        for number in pending:
+            shared = shared_frames([runs[one] for one in order], runs[number])
+            found = join(atlas, runs[number].atlas, shared)
+            if isinstance(found, Atlas):
                 break
-            reasons |= dict.fromkeys(part.runs, found)
+            reasons[number] = found
         else:
             break
-        first = found
-        reasons = {number: why for number, why in reasons.items() if number not in part.runs}
-        pending.remove(part)
-    atlas, order, images = first.atlas, first.runs, first.images
+        atlas, order, known = found, [*order, number], {row: images[one] for one, row in reversed(shared)}
+        begin = len(images)
+        images += [known.get(row, begin + row) for row in range(len(runs[number].records))]
+        pending.remove(number)
+        reasons.pop(number, None)
     if len(order) == 1:
         why = "; ".join(f"{runs[number].finished.folder}: {reason}" for number, reason in reasons.items())
         raise ValueError(f"none can be joined with {runs[0].finished.folder}, so there is no merged run: {why}")
-    for number in (number for part in pending for number in part.runs):
+    for number in pending:
         atlas, order = beside(atlas, runs[number].atlas), [*order, number]
         images += range(len(images), len(images) + len(runs[number].records))
     atlas = set_unjoined_apart(atlas, kept=0)
@@ -171,52 +173,6 @@ def merged(runs: Sequence[MergeableRun], has_truth: bool) -> Merged:
     records = in_one_world(records, [runs[number] for number in order], atlas)
     is_placed = [node.is_placed for node in atlas.graph.nodes[atlas.graph.first_node :]]
     return Merged(MappingRun(atlas, records=records), order, reasons, first_placed(images, is_placed))
-
-
-@dataclass(frozen=True, eq=False)
-class Part:
-    """Runs that are joined, in the world and unit of the first.
-
-    Args:
-        runs: their numbers.
-        images: of the frames of all, one run after the other: the first row that has the same image.
-    """
-
-    atlas: Atlas
-    runs: list[int]
-    images: list[int]
-
-
-def joined_by_images(parts: Sequence[Part], runs: Sequence[MergeableRun]) -> list[Part]:
-    """Join neighbours that have images in common, two and two, until there are none.
-
-    To join costs as much as both have frames. So each frame of a long walk in many chunks takes part in few joins.
-    """
-    before, after = [], [*parts]
-    while len(after) != len(before):
-        before, after = after, []
-        for part in before:
-            is_left = bool(after) and after[-1] in before  # not joined in this round
-            found = joined(after[-1], part, runs, needs_images=True) if is_left else ""
-            after = [*after[:-1], found] if isinstance(found, Part) else [*after, part]
-    return after
-
-
-def joined(one: Part, other: Part, runs: Sequence[MergeableRun], needs_images: bool = False) -> Part | str:
-    """Join two parts, in the world and unit of the first; if that fails, say why."""
-    shared, begin = [], 0
-    for number in other.runs:
-        found = shared_frames([runs[row] for row in one.runs], runs[number])
-        shared += [(a, begin + b) for a, b in found]
-        begin += len(runs[number].records)
-    if needs_images and not shared:
-        return "they have no image in common"
-    atlas = join(one.atlas, other.atlas, shared)
-    if isinstance(atlas, str):
-        return atlas
-    known, begin = {row: one.images[a] for a, row in reversed(shared)}, len(one.images)
-    images = [known.get(row, known.get(first, begin + first)) for row, first in enumerate(other.images)]
-    return Part(atlas, [*one.runs, *other.runs], [*one.images, *images])
 
 
 def shared_frames(parts: Sequence[MergeableRun], other: MergeableRun) -> list[tuple[int, int]]:

@@ -24,7 +24,6 @@ from emgs_jax.back_end.factors import (
 )
 from emgs_jax.back_end.loops import (
     consistent_loops,
-    detect_loops_between,
     is_closure_due,
     not_in_graph,
     query_prior,
@@ -40,7 +39,7 @@ from emgs_jax.back_end.optimization import (
     nodes_of,
     one_layer_of_state,
 )
-from emgs_jax.back_end.state import BackEnd, Node, Refusal, add_node, transform_nodes
+from emgs_jax.back_end.state import BackEnd, Node, add_node, transform_nodes
 from emgs_jax.data.images import Images
 from emgs_jax.device.arrays import to_se3
 from emgs_jax.device.clock import Clock
@@ -231,22 +230,6 @@ def test_what_is_contradicted_on_the_way_is_taken_back_at_once(graph, monkeypatc
     change = end.poses[-1] @ np.linalg.inv(before)
     assert np.linalg.norm(change[:3, 3]) > 1e-3
     np.testing.assert_allclose(atlas.world.motion.as_matrix(), change @ motion.as_matrix(), atol=1e-5)
-
-
-def test_a_keyframe_of_a_walk_in_chunks_has_no_more_candidates_than_in_one_run(graph, monkeypatch):
-    """However often its chunk is joined: two candidates of the last one were tested before, five are allowed."""
-    end, images = BackEnd(graph, (1, 1, 1, 1), 0.01), np.zeros((0, 2), np.float32)
-    poses = np.eye(4)
-    nodes = tuple(Node(poses, poses, 0.0, row, submap=int(row > 6)) for row in range(9))
-    keyframes = tuple(Keyframe(row, images, images, images, (1, 1, 1, 1), (4, 3), images) for row in range(9))
-    before = [Refusal(7, 8, "matches", 0.0), Refusal(5, 8, "matches", 0.0)]
-    end = replace(end, nodes=nodes, database=Database(keyframes), refusals=before)
-    tested = []
-    everything = lambda database, rows, config: iter([[*range(row)] for row in rows])  # noqa: E731
-    monkeypatch.setattr(back_end.loops, "propose_for_all", everything)
-    monkeypatch.setattr(back_end.loops, "_verify_candidate", lambda end, *pair, **_: tested.append(pair) or end)
-    detect_loops_between(end, 1, is_one_walk=True)
-    assert tested == [(7, 0), (7, 1), (7, 2), (7, 3), (7, 4), (8, 0), (8, 1), (8, 2)]
 
 
 def test_a_loop_that_cannot_be_solved_changes_nothing(graph):

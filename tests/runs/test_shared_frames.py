@@ -15,8 +15,7 @@ from emgs_jax.geometry import Sim3, pose_difference
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe
 from emgs_jax.mapping.merging import shared_placement, without_repeats
 from emgs_jax.mapping.records import FrameRecord
-from emgs_jax.runs import merging
-from emgs_jax.runs.merging import Part, first_placed, joined_by_images, shared_frames
+from emgs_jax.runs.merging import first_placed, shared_frames
 
 
 def keyframe(row: int, image: int, depth: float = 1.0) -> Keyframe:
@@ -50,30 +49,6 @@ def run(images, folder="", first_node=0):
 )
 def test_runs_have_images_in_common_that_have_the_same_name_time_and_keypoints(parts, other, pairs):
     assert shared_frames(parts, other) == pairs
-
-
-@pytest.mark.parametrize("count", [2, 3, 8, 11])
-def test_a_frame_of_a_walk_in_many_chunks_takes_part_in_few_joins(monkeypatch, count):
-    """Neighbours have two images in common; chunk 3 fits no other one."""
-    chunks, joins = [run(range(6 * number, 6 * number + 8)) for number in range(count)], np.zeros(count)
-    images = {number: [6 * number + row for row in range(8)] for number in range(count)}
-
-    def join(one, other, shared):
-        (mine, here), (its, there) = one, other
-        assert {(here[a], there[b]) for a, b in shared} == {(image, image) for image in {*here} & {*there}}
-        if 3 in its:
-            return "it does not fit"
-        joins[[*mine, *its]] += 1
-        return [*mine, *its], [*here, *there]
-
-    monkeypatch.setattr(merging, "join", join)
-    monkeypatch.setattr(merging, "Atlas", list)
-    found = joined_by_images([Part(([row], images[row]), [row], [*range(8)]) for row in range(count)], chunks)
-    assert [part.runs for part in found] == [[*range(min(3, count))], [*range(3, count)]][: 1 + (count > 3)]
-    assert joins.max() <= np.ceil(np.log2(count)) + 1
-    for part in found:
-        whole = [image for number in part.runs for image in images[number]]
-        assert part.images == [whole.index(image) for image in whole]
 
 
 def test_the_first_row_of_an_image_that_is_placed_stands_for_all():
