@@ -197,11 +197,12 @@ def test_the_command_goes_on_where_it_was_killed(tmp_path, launcher):
     check_joined(folders["whole"], [*range(12)])
 
     words, log = (*words, f"hydra.run.dir={folders['killed']}"), folders["killed"] / "chunks" / "2" / "frames.jsonl"
-    program = own_process.begin("experiments.run", *words, said=tmp_path / "said")
-    own_process.wait_for(lambda: log.exists() and log.read_bytes().count(b"\n") >= 2, program)
-    program.kill()
-    own_process.ended(program)
-    assert not (folders["killed"] / "map.npz").exists()
+    if launcher == "basic":  # the workers of another one may outlive the command
+        program = own_process.begin("experiments.run", *words, said=tmp_path / "said")
+        own_process.wait_for(lambda: log.exists() and log.read_bytes().count(b"\n") >= 2, program)
+        program.kill()
+        own_process.ended(program)
+        assert not (folders["killed"] / "map.npz").exists()
     with owned(folders["killed"] / "chunks" / "3"):
         done = own_process.run("experiments.run", *words, timeout=600)
     assert done.returncode == 1, done.stderr
