@@ -121,7 +121,7 @@ def atlas_of(seeds, first_node):
 
 
 def test_every_node_is_found_among_those_of_the_merged_run_saved_maps_included(monkeypatch):
-    monkeypatch.setattr(merging, "train_database", lambda keyframes, config: Database())  # there are none
+    monkeypatch.setattr(merging, "with_keyframes", lambda *_: Database())  # there are none
     parts = [atlas_of(range(10, 15), 2), atlas_of(range(20, 24), 0), atlas_of(range(30, 36), 3)]
     merged = beside(beside(parts[0], parts[1]), parts[2])
     for part, moved in zip(parts, moved_parts(parts, merged.graph.nodes), strict=True):
