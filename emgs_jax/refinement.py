@@ -164,12 +164,12 @@ def without_scattered(
 ) -> Gaussians:
     """Invalidate the new Gaussians of a frame whose splats are wider than `max_splat_std`, as scattered points are.
 
-    `count` Gaussians cover an image with n pixels each, and a square of n pixels has a standard deviation of √(n / 6)
+    The rows of `new` cover an image with n pixels each, and a square of n pixels has a standard deviation of √(n / 6)
     over both axes. `SQUARES` times that is allowed where it is more, as in large images. The floor of covariances,
     `min_std`, does not count: near the camera it alone is wider.
 
     Args:
-        new: Gaussians of one frame, world frame; their rows are as many as an image has.
+        new: Gaussians of one frame, world frame.
         camera: of the images that are rendered.
     """
     splats = splats_of(new, T_world_camera, camera, config.render)

@@ -130,8 +130,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         if is_live:  # all its frames are known now
             origin["data"] = described(dataset)
         origin["config"] |= {"dataset": dataset.recording() or settings["dataset"]}
-        compared = [*fused] if dataset.has_ground_truth else None
-        metrics, notes = _write(session, raw, dataset, prior, baselines, compared, (evaluation, densify), folder)
+        metrics, notes = _write(session, raw, dataset, prior, baselines, (evaluation, densify), folder)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
         metrics |= dataset.report()
         metrics |= scale_off(metrics)
@@ -223,14 +222,10 @@ def _write(
     dataset: ReadableFrames,
     prior: Prior,
     baselines: Baselines,
-    compared: list[str] | None,
     configs: tuple[EvaluationConfig, DensifyConfig],
     folder: Path,
 ) -> tuple[dict[str, Any], list[str]]:
     """Draw the map, write it and compare it with the truth; the raw prior is scored meanwhile.
-
-    Args:
-        compared: names of the baselines; None without a truth.
 
     Returns:
         The metrics, and what is to be said of the files.
@@ -249,8 +244,8 @@ def _write(
             unit = "m" if is_metric(prior.provenance.settings) else "units"
             notes = save_outputs(folder, run, dense, densify, title, evaluation.alignment == "sim3", unit)
             save_classes(folder, prior)
-        words = "" if compared is None else ", ".join(["the map", "the raw prior", *compared])
-        with _said(clock, "evaluate", words and f"comparing with the truth: {words}"):
+        compared = ", ".join(["the map", "the raw prior", *baselines.raw]) if dataset.has_ground_truth else ""
+        with _said(clock, "evaluate", compared and f"comparing with the truth: {compared}"):
             scorer, labels = truth.result(), None if labelled is None else labelled.centers
             metrics = score_map(run, dense.cloud, center_cloud(run), labels, scorer) | dense.rendering
             return metrics | of_prior.result() | score_baselines(run, baselines, raw, scorer), notes
