@@ -26,6 +26,8 @@ from emgs_jax.ops.neighbours import group_points, nearest, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
 
+CLEAR = 2.0  # kσ of free space, which a surface does not open in one step when the depths of a network drift
+BESIDE = 0.03  # of the width of an image, by which edges of a network, or of a pose, may be off
 MIN_GAP = 2.0  # standard deviations along the normal; two Gaussians closer than this are one thick sheet
 
 
@@ -40,6 +42,8 @@ class ExistenceConfig(eqx.Module):
             explains none of its points.
         max_log_odds: upper limit, so that a bounded number of frames outweighs any number of earlier ones.
         refuted: log-odds below which a Gaussian is removed; `-inf` never, as printed.
+        patience: looks in a row that clearly see through a Gaussian after which it is removed, however many saw it
+            before; `inf` never, as printed.
         num_std: k, standard deviations of the depth between a Gaussian and the surface that a frame sees, within which
             it counts as seen.
         min_cos: between its normal and the ray; in a more grazing view it is neither seen nor seen through.
@@ -55,6 +59,7 @@ class ExistenceConfig(eqx.Module):
     hit: Float[Array, "*b"] = traced(low=0)
     miss: Float[Array, "*b"] = traced(low=0)
     refuted: Float[Array, "*b"] = traced(low=-math.inf)
+    patience: Float[Array, "*b"] = traced(low=1, high=math.inf)
     max_mahalanobis_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
     max_layer_sq: Float[Array, "*b"] = traced(low=0, high=math.inf)
     feature: Float[Array, "*b"] = choice("medoid", "accumulated")
@@ -79,6 +84,26 @@ class Look(NamedTuple):
     T_world_camera: jaxlie.SE3
     camera: Camera
     depth_noise: Float[Array, ""]
+
+
+class Sight(NamedTuple):
+    """What a frame shows where each Gaussian is.
+
+    Args:
+        index: its pixel.
+        is_seen: whether the frame shows a surface there.
+        is_seen_through: whether the frame shows free space there, up to a surface farther than kσ behind.
+        reach: kσ (m).
+        depth: of the Gaussian, z (m).
+        variance: along its normal (m²).
+    """
+
+    index: Int[Array, "n"]
+    is_seen: Bool[Array, "n"]
+    is_seen_through: Bool[Array, "n"]
+    reach: Float[Array, "n"]
+    depth: Float[Array, "n"]
+    variance: Float[Array, "n"]
 
 
 class Seen(NamedTuple):
@@ -129,6 +154,9 @@ def update_existence(
     against it; otherwise a map would grow as long as a camera looks at it. A confirmed Gaussian counts as redundant
     only if it is as wide as a pixel: a view from afar does not have a point for each.
 
+    So it takes many frames to remove what many have seen. What has changed between two visits goes sooner: `patience`
+    looks in a row that clearly see through a Gaussian remove it, see `_looks_through`.
+
     Args:
         map: all Gaussians, world frame.
         use: evidence of this frame's points, see `fusion_evidence`.
@@ -140,18 +168,50 @@ def update_existence(
     view, T_world_camera, camera, depth_noise = look
     gaussians = map.gaussians
     depths = depth_range(view, T_world_camera, camera)
-    _, is_seen, is_seen_through, depth, variance = _sight(
-        gaussians, depths, T_world_camera, camera, depth_noise, config
-    )
+    sight = _sight(gaussians, depths, T_world_camera, camera, depth_noise, config)
+    is_seen, is_seen_through = sight.is_seen, sight.is_seen_through
 
-    spread = 0.5 * (jnp.trace(gaussians.covs, axis1=-2, axis2=-1) - variance)  # variance along the surface
-    has_points = spread >= (depth / camera.focal[0]) ** 2
+    spread = 0.5 * (jnp.trace(gaussians.covs, axis1=-2, axis2=-1) - sight.variance)  # variance along the surface
+    has_points = spread >= (sight.depth / camera.focal[0]) ** 2
     is_superfluous = is_seen & (use < 0) & (has_points | (map.existence <= 0))
     change = config.hit * ((use > 0) & ~is_seen_through) - config.miss * (is_seen_through | is_superfluous)
     existence = jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)
     existence = jnp.where(change == 0, map.existence, existence)
-    updated = eqx.tree_at(lambda m: m.existence, map, existence)
-    return without(updated, existence < config.refuted), is_seen
+
+    num_through = _looks_through(map.num_through, sight, depths[0], camera)
+    is_gone = (existence < config.refuted) | (num_through >= config.patience)
+    updated = eqx.tree_at(lambda m: (m.existence, m.num_through), map, (existence, num_through))
+    return without(updated, is_gone), is_seen
+
+
+def _looks_through(before: Int[Array, "n"], sight: Sight, depth: Float[Array, "p"], camera: Camera) -> Int[Array, "n"]:
+    """Count the looks in a row that clearly see through each Gaussian, see `GaussianMap.num_through`.
+
+    A look is clear if it shows free space farther than `CLEAR` kσ, and nothing as far away as the Gaussian within
+    `BESIDE` of the image's width: the edge of a surface that a network or a pose puts aside is no free space. Where
+    space opens in a smaller step the surface drifts, and no look counts until one sees it again.
+
+    Args:
+        depth: nearest that the look shows around each pixel.
+    """
+    gap = depth[sight.index] - sight.depth
+    is_step = sight.is_seen_through & (gap <= CLEAR * sight.reach) & (before == 0)
+    is_clear = sight.is_seen_through & ~_is_beside(depth, sight, camera) & (before >= 0)
+    return jnp.where(sight.is_seen, 0, jnp.where(is_step, -1, before + is_clear))
+
+
+def _is_beside(depth: Float[Array, "p"], sight: Sight, camera: Camera) -> Bool[Array, "n"]:
+    """Test whether a look shows something as far away as each Gaussian, within `CLEAR` kσ, at or beside its pixel."""
+    image, ends = depth.reshape(camera.height, camera.width), (camera.height - 1, camera.width - 1)
+    pixel = jnp.divmod(sight.index, camera.width)
+    shifts = jnp.arange(-2, 3) * max(1, round(BESIDE * camera.width / 2))  # of depths over 3 × 3 pixels
+
+    def look_beside(found: Bool[Array, "n"], shift: tuple) -> tuple[Bool[Array, "n"], None]:
+        beside = image[tuple(jnp.clip(at + by, 0, end) for at, by, end in zip(pixel, shift, ends, strict=True))]
+        return found | (jnp.abs(beside - sight.depth) <= CLEAR * sight.reach), None
+
+    rows, columns = (shift.reshape(-1) for shift in jnp.meshgrid(shifts, shifts))
+    return jax.lax.scan(look_beside, jnp.zeros(sight.depth.shape, bool), (rows, columns))[0]
 
 
 @full_precision
@@ -164,8 +224,8 @@ def take_back(map: GaussianMap, seen: Seen, camera: Camera, config: ExistenceCon
         camera: of the frame's rows.
     """
     depths = jnp.where(seen.depth > 0, seen.depth, jnp.nan)
-    index, is_seen, *_ = _sight(map.gaussians, depths, seen.T_world_camera, camera, seen.depth_noise, config)
-    is_wrong = is_seen & seen.moves[index]
+    sight = _sight(map.gaussians, depths, seen.T_world_camera, camera, seen.depth_noise, config)
+    is_wrong = sight.is_seen & seen.moves[sight.index]
     existence = jnp.where(is_wrong, map.existence - config.hit - config.miss, map.existence)
     updated = eqx.tree_at(lambda m: m.existence, map, existence)
     return without(updated, is_wrong & (existence < config.refuted))
@@ -178,8 +238,8 @@ def _sight(
     camera: Camera,
     depth_noise: Float[Array, ""],
     config: ExistenceConfig,
-) -> tuple[Int[Array, "n"], Bool[Array, "n"], Bool[Array, "n"], Float[Array, "n"], Float[Array, "n"]]:
-    """Find each Gaussian's pixel, whether it is seen or seen through there, its depth, and variance along its normal.
+) -> Sight:
+    """Compare each Gaussian with a frame.
 
     Args:
         depths: that a frame shows around each pixel, see `depth_range`.
@@ -195,7 +255,7 @@ def _sight(
     is_looked_at = gaussians.valid & inside & (depth > NEAREST_DEPTH) & is_steep
     is_seen = is_looked_at & (jnp.minimum(jnp.abs(depth - nearest), jnp.abs(depth - farthest)) <= reach)
     is_seen_through = is_looked_at & (depth < nearest - reach)
-    return index, is_seen, is_seen_through, depth, variance
+    return Sight(index, is_seen, is_seen_through, reach, depth, variance)
 
 
 @full_precision
@@ -230,6 +290,7 @@ def merge_duplicates(
         num_updates=map.num_updates + other.num_updates,
         existence=jnp.maximum(map.existence, other.existence),
         birth=map.birth,
+        num_through=map.num_through,
     )
     map = where_rows(is_pair & is_heavier, joined, map)
     return without(map, is_pair & ~is_heavier)

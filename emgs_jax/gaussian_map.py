@@ -28,6 +28,7 @@ class GaussianMap(eqx.Module):
             fused into it, but not aligned against it, and it is not exported.
         birth: `SlamState.time` of the frame that made it. It moves with that frame, because later frames were
             registered to it.
+        num_through: looks in a row that clearly saw through it; -1 while its surface drifts, see `update_existence`.
     """
 
     gaussians: Gaussians
@@ -35,6 +36,7 @@ class GaussianMap(eqx.Module):
     num_updates: Int[Array, "*b n"]
     existence: Float[Array, "*b n"]
     birth: Int[Array, "*b n"]
+    num_through: Int[Array, "*b n"]
 
 
 class AverageConfig(eqx.Module):
@@ -74,7 +76,7 @@ class SubmapConfig(eqx.Module):
 def empty_map(capacity: int, num_features: int) -> GaussianMap:
     """Make a map without Gaussians."""
     nothing, none = jnp.zeros(capacity), jnp.zeros(capacity, jnp.int32)
-    return GaussianMap(empty_gaussians(capacity, num_features), nothing, none, nothing, none)
+    return GaussianMap(empty_gaussians(capacity, num_features), nothing, none, nothing, none, none)
 
 
 def new_map(
@@ -83,7 +85,7 @@ def new_map(
     """Make a map of new Gaussians, all with the same log-odds of existence and from the same frame."""
     num_updates = jnp.ones(weight.shape, jnp.int32)
     existence, birth = (jnp.broadcast_to(value, weight.shape) for value in (existence, birth))
-    return GaussianMap(gaussians, weight, num_updates, existence, birth)
+    return GaussianMap(gaussians, weight, num_updates, existence, birth, jnp.zeros_like(num_updates))
 
 
 def confirmed(map: GaussianMap) -> Gaussians:
@@ -123,7 +125,9 @@ def transform_rows(
         "means": lambda _: means,
         "covs": shapes,
         "normals": lambda normals: jnp.einsum("...ij,...j->...i", turn, normals),
-        **dict.fromkeys(("colors", "features", "valid", "weight", "num_updates", "existence", "birth"), same),
+        **dict.fromkeys(
+            ("colors", "features", "valid", "weight", "num_updates", "existence", "birth", "num_through"), same
+        ),
     }
 
     def moved(part: Any) -> Any:

@@ -113,6 +113,7 @@ def _fused_into(
         num_updates=total(map.num_updates),
         existence=map.existence.at[to].max(map.existence),
         birth=map.birth,
+        num_through=map.num_through,
     )
     has_taken = total(jnp.ones(count, jnp.int32)) > 1
     return without(where_rows(has_taken, fused, map), is_one)

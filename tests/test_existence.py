@@ -109,6 +109,40 @@ def test_a_slab_before_a_mapped_wall_goes_within_20_looks_and_wall_and_pole_stay
     assert not map.gaussians.means[len(WALL)].any()  # the row is free
 
 
+def looked_at(depths, settings) -> GaussianMap:
+    """The slab, seen often before, after looks at depths; None is a look at what hides it."""
+    map = map_of(discs(SLAB), existence=float(settings.max_log_odds))
+    for depth in depths:
+        map, _ = judged(map, 1, look(1.0 if depth is None else depth), HERE, CAMERA, NOISE, settings)
+    return map
+
+
+@pytest.mark.parametrize(
+    ("depths", "stays"),
+    [
+        pytest.param([3.0, 3.0], True, id="too few looks"),
+        pytest.param([3.0, 3.0, 3.0], False, id="it has gone"),
+        pytest.param([3.0, None, 3.0, None, 3.0], False, id="hidden in between"),
+        pytest.param([3.0, 3.0, 2.0, 3.0, 3.0], True, id="seen in between"),
+        pytest.param([2.0 * 1.04**n for n in range(8)], True, id="depths drift"),
+        pytest.param([2.15, 2.4, 3.0, 3.0, 3.0], True, id="space opens in steps"),
+        pytest.param([2.15, 2.0, 3.0, 3.0, 3.0], False, id="seen again after a step, then gone"),
+        pytest.param([3.0, 2.15, 3.0, 2.15], True, id="small steps do not count"),
+        pytest.param([3.0, 2.15, 3.0, 2.15, 3.0], False, id="nor do they end a row"),
+    ],
+)
+def test_what_was_seen_often_goes_after_a_few_looks_through_it_unless_depths_drift(depths, stays, settings):
+    """At 2 m, space of 12 cm is free and of 24 cm clearly so."""
+    valid = np.asarray(looked_at(depths, settings).gaussians.valid)
+    assert valid.all() if stays else not valid.any()
+
+
+def test_patience_is_a_number_of_looks_and_infinite_as_printed(settings):
+    for patience, stays in ((5.0, True), (4.0, False), (np.inf, True)):
+        settings = replace(settings, patience=device(patience))
+        assert np.asarray(looked_at([3.0] * 4, settings).gaussians.valid).all() == stays
+
+
 def test_a_fresh_wrong_gaussian_goes_sooner_and_one_that_explains_is_confirmed(settings):
     map = map_of(discs([(0, 0, 3.0), (0.2, 0, 2.7)]), existence=float(settings.birth))
     assert not is_confirmed(map).any()
@@ -338,7 +372,9 @@ def test_layers_of_visits_that_moved_become_one_though_nobody_looks(settings):
 def test_as_printed_nothing_changes_by_a_bit(config):
     printed = config("slam/existence=paper").existence
     map = map_of(discs(WALL), discs(SLAB), existence=float(printed.birth))
-    after, is_seen = judged(map, -1, look(3.0), HERE, CAMERA, NOISE, printed)
+    for _ in range(5):
+        after, is_seen = judged(map, -1, look(3.0), HERE, CAMERA, NOISE, printed)
+    after = replace(after, num_through=map.num_through)  # it counts
     assert_same(after, rows_of(map, slice(None)))
     assert is_seen[: len(WALL)].any()  # it looks, but draws no conclusion
     assert_same(joined(map, is_seen, HERE, NOISE, printed), after)

@@ -35,9 +35,18 @@ def test_a_map_reloads_bit_for_bit(tmp_path, width):
     assert (tmp_path / "map.npz").read_bytes() == (tmp_path / "again.npz").read_bytes()
     with np.load(tmp_path / "map.npz", allow_pickle=False) as arrays:
         assert set(arrays) == {
-            *("weight", "num_updates", "existence", "birth", "__header__"),
+            *("weight", "num_updates", "existence", "birth", "num_through", "__header__"),
             *(f"gaussians.{name}" for name in ("means", "covs", "colors", "normals", "features", "valid")),
         }
+
+
+def test_a_map_of_a_version_without_looks_through_is_read_as_if_none_had_been(tmp_path):
+    path, map = tmp_path / "map.npz", a_map()
+    save_map(path, map)
+    with np.load(path) as file:
+        arrays = {name: array for name, array in file.items() if name != "num_through"}
+    np.savez(path, **arrays)
+    assert_same(load_map(path), map)
 
 
 def test_truncated_or_flipped_maps_raise_value_error_or_hold_the_same(tmp_path):
