@@ -27,6 +27,7 @@ from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
 
 CLEAR = 2.0  # kσ of free space, which a surface does not open in one step when the depths of a network drift
+VIEW = 0.05  # radians between two views, whose errors are not the same
 BESIDE = 0.03  # of the width of an image, by which edges of a network, or of a pose, may be off
 MIN_GAP = 2.0  # standard deviations along the normal; two Gaussians closer than this are one thick sheet
 
@@ -42,8 +43,8 @@ class ExistenceConfig(eqx.Module):
             explains none of its points.
         max_log_odds: upper limit, so that a bounded number of frames outweighs any number of earlier ones.
         refuted: log-odds below which a Gaussian is removed; `-inf` never, as printed.
-        patience: looks in a row that clearly see through a Gaussian after which it is removed, however many saw it
-            before; `inf` never, as printed.
+        patience: views in a row that clearly see through a Gaussian after which it is removed, however many frames
+            saw it before; `inf` never, as printed.
         num_std: k, standard deviations of the depth between a Gaussian and the surface that a frame sees, within which
             it counts as seen.
         min_cos: between its normal and the ray; in a more grazing view it is neither seen nor seen through.
@@ -78,12 +79,14 @@ class Look(NamedTuple):
         T_world_camera: its pose.
         camera: of its rows.
         depth_noise: of its points, as a fraction of their depth.
+        T_world_previous: pose of the frame before.
     """
 
     view: Observation
     T_world_camera: jaxlie.SE3
     camera: Camera
     depth_noise: Float[Array, ""]
+    T_world_previous: jaxlie.SE3
 
 
 class Sight(NamedTuple):
@@ -155,7 +158,9 @@ def update_existence(
     only if it is as wide as a pixel: a view from afar does not have a point for each.
 
     So it takes many frames to remove what many have seen. What has changed between two visits goes sooner: `patience`
-    looks in a row that clearly see through a Gaussian remove it, see `_looks_through`.
+    views in a row that clearly see through a Gaussian remove it, see `_views_through`. As frames from one place err
+    alike, a frame is as much of a view as the camera has moved since the one before, seen from the Gaussian: by the
+    angle of its turn and that of its shift, up to `VIEW`.
 
     Args:
         map: all Gaussians, world frame.
@@ -165,7 +170,7 @@ def update_existence(
     Returns:
         The map, and which Gaussians were seen.
     """
-    view, T_world_camera, camera, depth_noise = look
+    view, T_world_camera, camera, depth_noise, T_world_previous = look
     gaussians = map.gaussians
     depths = depth_range(view, T_world_camera, camera)
     sight = _sight(gaussians, depths, T_world_camera, camera, depth_noise, config)
@@ -178,37 +183,44 @@ def update_existence(
     existence = jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)
     existence = jnp.where(change == 0, map.existence, existence)
 
-    num_through = _looks_through(map.num_through, sight, depths[0], camera)
+    motion = T_world_previous.inverse() @ T_world_camera
+    turn, shift = (jnp.linalg.norm(part) for part in (motion.rotation().log(), motion.translation()))
+    share = jnp.minimum((turn + shift / jnp.maximum(sight.depth, NEAREST_DEPTH)) / VIEW, 1.0)
+    num_through = _views_through(map.num_through, share, sight, depths[0], camera)
     is_gone = (existence < config.refuted) | (num_through >= config.patience)
     updated = eqx.tree_at(lambda m: (m.existence, m.num_through), map, (existence, num_through))
     return without(updated, is_gone), is_seen
 
 
-def _looks_through(before: Int[Array, "n"], sight: Sight, depth: Float[Array, "p"], camera: Camera) -> Int[Array, "n"]:
-    """Count the looks in a row that clearly see through each Gaussian, see `GaussianMap.num_through`.
+def _views_through(
+    before: Float[Array, "n"], share: Float[Array, "n"], sight: Sight, depth: Float[Array, "p"], camera: Camera
+) -> Float[Array, "n"]:
+    """Count the views in a row that clearly see through each Gaussian, see `GaussianMap.num_through`.
 
     A look is clear if it shows free space farther than `CLEAR` kσ, and nothing as far away as the Gaussian within
     `BESIDE` of the image's width: the edge of a surface that a network or a pose puts aside is no free space. Where
     space opens in a smaller step the surface drifts, and no look counts until one sees it again.
 
     Args:
+        share: of a view that this look is.
         depth: nearest that the look shows around each pixel.
     """
     gap = depth[sight.index] - sight.depth
-    is_step = sight.is_seen_through & (gap <= CLEAR * sight.reach) & (before == 0)
-    is_clear = sight.is_seen_through & ~_is_beside(depth, sight, camera) & (before >= 0)
-    return jnp.where(sight.is_seen, 0, jnp.where(is_step, -1, before + is_clear))
+    is_far = sight.is_seen_through & (gap > CLEAR * sight.reach)
+    is_clear = is_far & ~_is_beside(depth, sight, camera) & (before >= 0)
+    is_step = sight.is_seen_through & ~is_far & (before == 0)
+    return jnp.where(sight.is_seen, 0.0, jnp.where(is_step, -1.0, before + share * is_clear))
 
 
 def _is_beside(depth: Float[Array, "p"], sight: Sight, camera: Camera) -> Bool[Array, "n"]:
-    """Test whether a look shows something as far away as each Gaussian, within `CLEAR` kσ, at or beside its pixel."""
+    """Test whether a look shows something as far away as each Gaussian, within kσ, beside its pixel."""
     image, ends = depth.reshape(camera.height, camera.width), (camera.height - 1, camera.width - 1)
     pixel = jnp.divmod(sight.index, camera.width)
     shifts = jnp.arange(-2, 3) * max(1, round(BESIDE * camera.width / 2))  # of depths over 3 × 3 pixels
 
     def look_beside(found: Bool[Array, "n"], shift: tuple) -> tuple[Bool[Array, "n"], None]:
         beside = image[tuple(jnp.clip(at + by, 0, end) for at, by, end in zip(pixel, shift, ends, strict=True))]
-        return found | (jnp.abs(beside - sight.depth) <= CLEAR * sight.reach), None
+        return found | (jnp.abs(beside - sight.depth) <= sight.reach), None
 
     rows, columns = (shift.reshape(-1) for shift in jnp.meshgrid(shifts, shifts))
     return jax.lax.scan(look_beside, jnp.zeros(sight.depth.shape, bool), (rows, columns))[0]

@@ -28,7 +28,7 @@ class GaussianMap(eqx.Module):
             fused into it, but not aligned against it, and it is not exported.
         birth: `SlamState.time` of the frame that made it. It moves with that frame, because later frames were
             registered to it.
-        num_through: looks in a row that clearly saw through it; -1 while its surface drifts, see `update_existence`.
+        num_through: views in a row that clearly saw through it; -1 while its surface drifts, see `update_existence`.
     """
 
     gaussians: Gaussians
@@ -36,7 +36,7 @@ class GaussianMap(eqx.Module):
     num_updates: Int[Array, "*b n"]
     existence: Float[Array, "*b n"]
     birth: Int[Array, "*b n"]
-    num_through: Int[Array, "*b n"]
+    num_through: Float[Array, "*b n"]
 
 
 class AverageConfig(eqx.Module):
@@ -76,7 +76,7 @@ class SubmapConfig(eqx.Module):
 def empty_map(capacity: int, num_features: int) -> GaussianMap:
     """Make a map without Gaussians."""
     nothing, none = jnp.zeros(capacity), jnp.zeros(capacity, jnp.int32)
-    return GaussianMap(empty_gaussians(capacity, num_features), nothing, none, nothing, none, none)
+    return GaussianMap(empty_gaussians(capacity, num_features), nothing, none, nothing, none, nothing)
 
 
 def new_map(
@@ -85,7 +85,7 @@ def new_map(
     """Make a map of new Gaussians, all with the same log-odds of existence and from the same frame."""
     num_updates = jnp.ones(weight.shape, jnp.int32)
     existence, birth = (jnp.broadcast_to(value, weight.shape) for value in (existence, birth))
-    return GaussianMap(gaussians, weight, num_updates, existence, birth, jnp.zeros_like(num_updates))
+    return GaussianMap(gaussians, weight, num_updates, existence, birth, jnp.zeros(weight.shape))
 
 
 def confirmed(map: GaussianMap) -> Gaussians:

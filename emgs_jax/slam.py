@@ -321,7 +321,9 @@ def step(state: SlamState, prediction: Prediction, camera: Camera, config: SlamC
     looks, seen = None, None
     if state.looks is not None:
         looks, seen = _look(state.looks, frame, state.T_world_previous, view, config.motion)
-    map, num_gaussians, overflow, time = _store(state.map, replace(submap, map=refined), new, frame, seen, view, config)
+    map, num_gaussians, overflow, time = _store(
+        state.map, replace(submap, map=refined), new, frame, seen, state.T_world_previous, view, config
+    )
 
     info = StepInfo(
         T_world_camera=frame.T_world_camera,
@@ -476,6 +478,7 @@ def _store(
     new: NewGaussians,
     frame: Frame,
     seen: Seen | None,
+    T_world_previous: jaxlie.SE3,
     view: Camera,
     config: SlamConfig,
 ) -> tuple[GaussianMap, Int[Array, ""], Int[Array, ""], Int[Array, ""]]:
@@ -486,7 +489,8 @@ def _store(
     """
     rows, T, noise = submap.rows, frame.T_world_camera, frame.localization.depth_noise
     evidence, map = fusion_evidence(map, submap.map, rows), write_back(map, submap.map, rows)
-    map, is_seen = config.stages.update_existence(map, evidence, Look(frame.seen, T, view, noise), config.existence)
+    look = Look(frame.seen, T, view, noise, T_world_previous)
+    map, is_seen = config.stages.update_existence(map, evidence, look, config.existence)
     if seen is not None:
         map = take_back(map, seen, view, config.existence)
     is_seen = jnp.take(is_seen, rows, mode="fill", fill_value=False)

@@ -284,8 +284,8 @@ def fresh_map(gaussians: Gaussians, weight=1.0, existence=1.0, birth=0) -> Gauss
     count = gaussians.valid.shape[0]
     weight, existence = (np.broadcast_to(np.asarray(x, float), count) for x in (weight, existence))
     births = np.broadcast_to(np.asarray(birth, np.int32), count)
-    ones, zeros = (make(count, np.int32) for make in (np.ones, np.zeros))
-    return GaussianMap(gaussians, *map(device, (weight, ones, existence, births, zeros)))
+    updates = np.ones(count, np.int32)
+    return GaussianMap(gaussians, *map(device, (weight, updates, existence, births, np.zeros(count))))
 
 
 def as_numpy(gaussians: Gaussians) -> dict[str, np.ndarray]:

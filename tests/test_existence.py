@@ -54,11 +54,15 @@ def filled(map: GaussianMap) -> GaussianMap:
     return eqx.tree_at(lambda m: m.gaussians.valid, more, more.gaussians.valid & (rows < count))
 
 
-def judged(map: GaussianMap, use, *look_and_settings):
-    """The rows of the map after a look that fused something into some of them, and which it sees."""
+def judged(map: GaussianMap, use, *look_and_settings, before=None):
+    """The rows of the map after a look that fused something into some of them, and which it sees.
+
+    The pose before is that of the look, or as given.
+    """
     count = map.weight.shape[0]
     *given, settings = look_and_settings
-    after, is_seen = judged_map(filled(map), np.resize(np.int32(use), NUM_ROWS), Look(*given), settings)
+    frame = Look(*given, given[1] if before is None else before)
+    after, is_seen = judged_map(filled(map), np.resize(np.int32(use), NUM_ROWS), frame, settings)
     return rows_of(after, slice(count)), is_seen[:count]
 
 
@@ -109,11 +113,12 @@ def test_a_slab_before_a_mapped_wall_goes_within_20_looks_and_wall_and_pole_stay
     assert not map.gaussians.means[len(WALL)].any()  # the row is free
 
 
-def looked_at(depths, settings) -> GaussianMap:
-    """The slab, seen often before, after looks at depths; None is a look at what hides it."""
-    map = map_of(discs(SLAB), existence=float(settings.max_log_odds))
+def looked_at(depths, settings, angle=0.06) -> GaussianMap:
+    """The slab, seen often before, after looks at depths, to each of which the camera turns by an angle (rad); None is
+    a look at what hides it."""
+    map, before = map_of(discs(SLAB), existence=float(settings.max_log_odds)), pose((0.0, angle, 0.0))
     for depth in depths:
-        map, _ = judged(map, 1, look(1.0 if depth is None else depth), HERE, CAMERA, NOISE, settings)
+        map, _ = judged(map, 1, look(1.0 if depth is None else depth), HERE, CAMERA, NOISE, settings, before=before)
     return map
 
 
@@ -135,6 +140,23 @@ def test_what_was_seen_often_goes_after_a_few_looks_through_it_unless_depths_dri
     """At 2 m, space of 12 cm is free and of 24 cm clearly so."""
     valid = np.asarray(looked_at(depths, settings).gaussians.valid)
     assert valid.all() if stays else not valid.any()
+
+
+def test_a_camera_that_hardly_moves_needs_more_looks_and_one_that_stands_is_no_second_view(settings):
+    """A frame is as much of a view as the angle to the one before, of .05."""
+    for angle, num, stays in ((0.02, 7, True), (0.02, 8, False), (0.0, 10, True), (0.5, 2, True)):
+        map = looked_at([3.0] * num, settings, angle)
+        assert np.asarray(map.gaussians.valid).all() == stays, (angle, num)
+
+
+@pytest.mark.parametrize(("aside", "stays"), [(2, True), (8, False)])
+def test_the_edge_of_a_surface_that_a_look_shows_somewhat_aside_stays(aside, stays, settings):
+    """By 2 of 64 pixels; by 8 it is another surface, and what was before goes."""
+    depth = np.full((CAMERA.height, CAMERA.width), 3.0)
+    depth[:, 22 + aside : 43 + aside] = 2.0
+    valid = np.asarray(looked_at([depth] * 4, settings).gaussians.valid)
+    assert valid.all() == stays
+    assert valid.sum() > 0.5 * len(SLAB)
 
 
 def test_patience_is_a_number_of_looks_and_infinite_as_printed(settings):

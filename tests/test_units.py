@@ -61,7 +61,7 @@ def fuse(map, aligned, noise, config):
 
 @sc.on_host
 def look(map, view, T, config):
-    frame = existence.Look(view, T, CAMERA, jnp.float32(0.02))
+    frame = existence.Look(view, T, CAMERA, jnp.float32(0.02), jaxlie.SE3.identity())
     updated, is_seen = existence.update_existence(map, jnp.arange(32) % 3 - 1, frame, config.existence)
     merged = existence.merge_duplicates(updated, is_seen, T.translation(), jnp.float32(0.1), config.existence)
     taken = merged.gaussians.valid[:, None, None]

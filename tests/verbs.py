@@ -253,7 +253,7 @@ VERBS = {
     ),
     "update_existence": (
         lambda m, o, T: existence.update_existence(
-            m, jnp.arange(32) % 3 - 1, existence.Look(o, T, CAMERA, ONE * 0.02), CONFIG.existence
+            m, jnp.arange(32) % 3 - 1, existence.Look(o, T, CAMERA, ONE * 0.02, T), CONFIG.existence
         ),
         lambda s: (map_of(s), sc.random_observation(192, s, 2), looking(s)),
     ),

@@ -29,8 +29,8 @@ def load_map(path: str | os.PathLike) -> GaussianMap:
         raise ValueError(f"{path} is no map.npz of a run that can be read ({error}): map again") from error
     fields, structure = jax.tree_util.tree_flatten_with_path(jax.eval_shape(lambda: empty_map(1, 1)))
     names = [_name(key) for key, _ in fields]
-    if "weight" in arrays:  # maps of older versions have no looks that saw through a Gaussian
-        arrays.setdefault("num_through", np.zeros(arrays["weight"].shape, np.int32))
+    if "weight" in arrays:  # maps of older versions have no views that saw through a Gaussian
+        arrays.setdefault("num_through", np.zeros(arrays["weight"].shape, np.float32))
     if sorted(arrays) != sorted(names):
         raise ValueError(f"{path} holds other arrays than those of a {CLASS}: map again")
     map = jax.tree.unflatten(structure, [arrays[name] for name in names])
