@@ -30,6 +30,7 @@ class Placed(NamedTuple):
     T_metres_world: Sim3
     residual: float  # metres, root mean square of the positions that count
     num_used: int
+    tilt_std_deg: float  # of the z axis of the positions, in the world; large where they lie on a level line
 
 
 def positions_of_exif(files: Sequence[Path | None]) -> Float[np.ndarray, "n 3"]:
@@ -95,6 +96,11 @@ def _in_metres(geographic: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]
     found = np.full(geographic.shape, np.nan)
     found[is_known] = _pycolmap().GPSTransform().ellipsoid_to_enu(geographic[is_known], *geographic[is_known][0])
     return found
+
+
+def is_geographic(path: Path) -> bool:
+    """Whether a file of positions has longitude, latitude and altitude: then z is up, and in others it may not be."""
+    return next((words[0].upper() == GEOGRAPHIC for _, _, words in words_of(path)), False)
 
 
 def read_positions(path: Path, names: Sequence[str], times: Sequence[float]) -> Float[np.ndarray, "n 3"]:
@@ -184,7 +190,7 @@ def scale_of_positions(centers: Float[np.ndarray, "n 3"], positions: Float[np.nd
     apart = positions[used] - positions[used].mean(axis=0)
     spread = float(np.sqrt(np.sum(apart**2)))
     if found is None or not spread > 0:
-        raise ValueError(f"{source}: the positions do not move, so they tell no scale")
+        raise ValueError(f"{source}: the positions do not move, or along a line alone, so they tell no scale")
     residual = float(np.sqrt(np.mean(off[used] ** 2)))
     degrees = max(3 * int(used.sum()) - 7, 1)
     std = float(np.sqrt(np.sum(off[used] ** 2) / degrees)) / spread
@@ -194,4 +200,18 @@ def scale_of_positions(centers: Float[np.ndarray, "n 3"], positions: Float[np.nd
             f"{source}: positions are off by {residual:.2g} m and lie {apart_by:.2g} m from their middle, so they "
             "tell no scale: are they of these images, and in metres?"
         )
-    return Placed(Scale(source, float(np.log(similarity.scale)), max(std, 1e-6)), similarity, residual, int(used.sum()))
+    scale = Scale(source, float(np.log(similarity.scale)), max(std, 1e-6))
+    tilt_std = _tilt_std(similarity.apply(centers[used]), std * spread)
+    return Placed(scale, similarity, residual, int(used.sum()), tilt_std)
+
+
+def _tilt_std(path: Float[np.ndarray, "n 3"], std: float) -> float:
+    """Standard deviation in degrees of the z axis of positions by which a path y is turned, each with `std`.
+
+    A turn w moves it by w × y, so its information is Σ (|y|² I - y yᵀ) / std², from the middle; it moves the z axis by
+    w × z. Positions themselves lie beside a line by their errors.
+    """
+    apart = path - path.mean(axis=0)
+    known = np.sum(apart**2) * np.eye(3) - apart.T @ apart
+    covariance = std**2 * np.linalg.inv(known + 1e-12 * np.trace(known) * np.eye(3))
+    return float(np.degrees(np.sqrt(covariance[0, 0] + covariance[1, 1])))

@@ -129,6 +129,22 @@ def test_the_scale_of_positions_is_calibrated():
     assert 0.8 < np.std(off) < 1.25
 
 
+def test_the_tilt_of_positions_is_calibrated_and_large_along_a_level_line():
+    off, said = [], []
+    for seed in range(200):
+        centers, positions, turn = path_and_positions(np.random.default_rng(seed), 0.3)
+        placed = scale_of_positions(centers, positions, "positions")
+        z = placed.T_metres_world.rotation @ turn[:, 2]
+        off.append(np.degrees(np.arccos(z[2])))
+        said.append(placed.tilt_std_deg)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(np.sqrt(np.mean(np.square(said))), rel=0.2)
+    rng = np.random.default_rng(0)
+    bent, noise = 0.001 * rng.normal(size=(20, 3)), 0.01 * rng.normal(size=(20, 3))
+    for line, low, high in (([1.0, 0.5, 0.0], 20, 1e9), ([0.0, 0.0, 1.0], 0, 0.1)):  # a turn about z leaves it
+        path = np.outer(np.arange(20.0), line) + bent
+        assert low < scale_of_positions(path, path + noise, "positions").tilt_std_deg < high
+
+
 def test_positions_of_something_else_tell_no_scale():
     rng = np.random.default_rng(0)
     centers, positions, _ = path_and_positions(rng, 0.0)
