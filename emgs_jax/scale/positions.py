@@ -11,7 +11,7 @@ from PIL import ExifTags, Image
 
 from emgs_jax.data.camera_models import load_pycolmap
 from emgs_jax.data.timestamps import in_seconds, nearest_rows
-from emgs_jax.geometry import Sim3
+from emgs_jax.geometry import Sim3, similarity_of
 from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.lines import numbers_in, words_of
 
@@ -169,18 +169,16 @@ def scale_of_positions(centers: Float[np.ndarray, "n 3"], positions: Float[np.nd
     Raises:
         ValueError: too few positions, or they lie no farther apart than they err.
     """
-    pycolmap = _pycolmap()
     is_known = np.isfinite(centers).all(axis=1) & np.isfinite(positions).all(axis=1)
     if is_known.sum() < MIN_POSITIONS:
         raise ValueError(
             f"{source}: {is_known.sum()} frames have a pose and a position, and {MIN_POSITIONS} are needed"
         )
     used = is_known
+    if not np.ptp(centers[used], axis=0).any():
+        raise ValueError(f"{source}: the path does not move, so positions tell no scale")
     for _ in range(NUM_STEPS):
-        found = pycolmap.estimate_sim3d(centers[used], positions[used])
-        if found is None:
-            break
-        similarity = Sim3(found.scale, found.rotation.matrix(), np.asarray(found.translation))
+        similarity = similarity_of(centers[used], positions[used])
         off = np.linalg.norm(similarity.apply(centers) - positions, axis=1)
         std = 1.4826 * float(np.median(off[is_known]))
         near = is_known & (off <= max(MAX_OFF * std, 1e-9))
@@ -189,8 +187,8 @@ def scale_of_positions(centers: Float[np.ndarray, "n 3"], positions: Float[np.nd
         used = near
     apart = positions[used] - positions[used].mean(axis=0)
     spread = float(np.sqrt(np.sum(apart**2)))
-    if found is None or not spread > 0:
-        raise ValueError(f"{source}: the positions do not move, or along a line alone, so they tell no scale")
+    if not spread > 0:
+        raise ValueError(f"{source}: the positions do not move, so they tell no scale")
     residual = float(np.sqrt(np.mean(off[used] ** 2)))
     degrees = max(3 * int(used.sum()) - 7, 1)
     std = float(np.sqrt(np.sum(off[used] ** 2) / degrees)) / spread

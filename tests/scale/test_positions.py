@@ -120,6 +120,17 @@ def test_a_path_is_aligned_without_the_positions_that_are_wrong():
     assert placed.T_metres_world.rotation == pytest.approx(turn.T, abs=0.01)
 
 
+@pytest.mark.parametrize("level", [[1, 1, 0], [1, 0, 0]])
+def test_positions_in_a_plane_or_on_a_line_tell_the_scale(level):
+    """Symptom: pycolmap finds no similarity to positions of rank 2, as of a robot on wheels: they "do not move"."""
+    rng = np.random.default_rng(0)
+    positions = np.cumsum(rng.normal(size=(30, 3)), axis=0) * level
+    centers = 0.4 * positions @ Rotation.random(random_state=3).as_matrix() + 0.001 * rng.normal(size=(30, 3))
+    placed = scale_of_positions(centers, positions, "positions")
+    assert placed.scale.factor == pytest.approx(2.5, rel=0.002)
+    assert (placed.tilt_std_deg > 5) == (sum(level) == 1)
+
+
 def test_the_scale_of_positions_is_calibrated():
     off = []
     for seed in range(200):
