@@ -1,5 +1,7 @@
 """A model at poses that are known but for their errors; oracles: pycolmap's synthetic scenes, and a rendered room."""
 
+from types import MappingProxyType
+
 import numpy as np
 import pycolmap
 import pytest
@@ -7,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from stereo_scene import room, shots, similarity_error, structure_config
 
 from emgs_jax.data.masks import stem
-from emgs_jax.structure import store
+from emgs_jax.structure import sequence, store
 from emgs_jax.structure.model import to_structure
 from emgs_jax.structure.posed import model_at
 from emgs_jax.structure.shots import DATABASE
@@ -107,3 +109,28 @@ def test_a_structure_of_images_at_their_poses(tmp_path, monkeypatch):
     assert off(found, truth)[0] < 0.002  # m
     made = to_structure([model], taken.names, config)
     assert similarity_error(made.T_world_camera[:, :3, 3], truth[:, :3, 3]) < 0.002
+
+
+class Posed(list):
+    """Poses as a data set."""
+
+    calibration, full_intrinsics, size, intrinsics = MappingProxyType({}), None, (160, 120), (131.2, 131.2, 79.5, 59.5)
+
+    def pose(self, index):
+        return self[index]
+
+
+@pytest.mark.parametrize("at_poses", [False, True])
+def test_a_data_sets_poses_are_those_of_its_shots(monkeypatch, at_poses):
+    """The second frame has none."""
+    T = np.stack([frame.T_world_camera for frame in room()])
+    dataset = Posed([T[0], None, T[2]])
+    taken = []
+    monkeypatch.setattr(sequence, "names_of", lambda dataset: ["a", "b", "c"])
+    monkeypatch.setattr(sequence, "make_models", lambda shots, *given: taken.append(shots) or ("key", []))
+    sequence.structure_of(dataset, structure_config(), None, at_poses)
+    (found,) = taken
+    assert (found.poses is None) != at_poses
+    if at_poses:
+        np.testing.assert_array_equal(found.poses[[0, 2]], T[[0, 2]])
+        assert np.isnan(found.poses[1]).all()
