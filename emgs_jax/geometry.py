@@ -53,6 +53,20 @@ class Sim3:
         return Sim3(1.0 / self.scale, rotation, -(rotation @ self.translation) / self.scale)
 
 
+def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3"]:
+    """Return the rotation R with the largest trace of Rᵀ · matrix, never a reflection."""
+    U, _, Vt = np.linalg.svd(matrix)
+    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+
+
+def similarity_of(x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "n 3"]) -> Sim3:
+    """Return the least-squares similarity from points x, which differ, to y (Umeyama 1991); any turn about a line."""
+    covariance = (y - y.mean(0)).T @ (x - x.mean(0))
+    rotation = nearest_rotation(covariance)
+    scale = float(np.trace(rotation.T @ covariance) / np.sum((x - x.mean(0)) ** 2))
+    return Sim3(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
+
+
 def rotated(vectors: np.ndarray, rotation: np.ndarray) -> np.ndarray:
     """Rotate each vector (..., 3). Not by BLAS, whose threads wait longer than so small a product takes."""
     return np.einsum("ij,...j->...i", rotation, vectors)

@@ -25,9 +25,12 @@ MEASURED, SILENT, UNUSABLE = "measured", "silent", "unusable"
 
 
 def detect_loops(end: BackEnd, frame: FrameData) -> BackEnd:
-    """Add the last node as a keyframe, and verify its loop candidates."""
+    """Add the last node as a keyframe, unless it opens its map, and verify its loop candidates.
+
+    The frame that opens a map was registered to nothing, so where it is beside the next ones is known least of all.
+    """
     time, config = len(end.nodes) - 1, end.config.place_recognition
-    if time % end.config.every:
+    if time % end.config.every or all(node.submap != end.active for node in end.nodes[:-1]):
         return end
     end = replace(end, database=add_keyframe(end.database, _keyframe(end, time, frame), config))
     row = len(end.database.keyframes) - 1
@@ -138,8 +141,9 @@ def remove_inconsistent(end: BackEnd) -> BackEnd:
 def _verify_candidate(end: BackEnd, row: int, other: int, is_free: bool = False) -> BackEnd:
     """Verify a loop between two keyframes, rows of the database, the later first, and record the outcome."""
     keyframes = end.database.keyframes
-    candidate, rows = keyframes[other], (k for k in (other - 1, other + 1) if 0 <= k < row)
+    candidate, rows = keyframes[other], (k for k in range(other - 2, other + 3) if 0 <= k < row and k != other)
     beside = [keyframes[k] for k in rows if _submap_id_of(end, k) == end.active]
+    beside = sorted(beside, key=lambda one: abs(one.frame - candidate.frame))[:2]  # at an end both of one side
     near = {one.frame: end.nodes[one.frame] for one in (candidate, *beside)}
     poses, log_scales = ({row: getattr(node, name) for row, node in near.items()} for name in ("pose", "log_scale"))
     neighbours = neighbours_of(candidate, beside, poses, log_scales)

@@ -7,7 +7,7 @@ import numpy as np
 
 from emgs_jax.data.pose_conventions import EXPECTED, READINGS
 from emgs_jax.data.timestamps import nearest_rows, resolution
-from emgs_jax.geometry import Sim3, pose_difference
+from emgs_jax.geometry import Sim3, nearest_rotation, pose_difference
 
 MIN_ODD_DEG, MIN_GAIN = 1.0, 3.0  # rotation per motion, and factor by which another convention must fit better
 _MAX_ROLL_STD = 0.25  # rad; above, orientations determine the roll about a path better than its positions
@@ -142,10 +142,7 @@ def _solve(
     x: np.ndarray, y: np.ndarray, covariance: np.ndarray, with_scale: bool, rotation: np.ndarray | None = None
 ) -> Sim3:
     """Solve for the rotation that maximises trace(Rᵀ · covariance), unless it is given, then scale and translation."""
-    if rotation is None:
-        u, _, vt = np.linalg.svd(covariance)
-        signs = np.array([1.0, 1.0, 1.0 if np.linalg.det(u @ vt) > 0 else -1.0])  # never a reflection
-        rotation = (u * signs) @ vt
+    rotation = nearest_rotation(covariance) if rotation is None else rotation
     scale = float(np.trace(rotation.T @ covariance)) / _spread(x) ** 2 if with_scale else 1.0
     return Sim3(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
 

@@ -35,6 +35,9 @@ WINDOW = 10.0  # seconds of a window
 MIN_FRAMES = 8  # of a window
 MAX_GAP = 2.0  # seconds between frames that the gyroscope bridges
 MIN_SECONDS = 3.0  # of a path
+# Root mean square by which rates may turn a window's frames otherwise than their rotations: degrees, or a share of how
+# far these turn. Of right ones it is .01, of a clock that is a twentieth of a second off .25, of other axes 1.5.
+MAX_TURNED_OFF = 5.0, 0.5
 BIASES_STD = 0.5, 0.003  # m/s² and rad/s: of the accelerometer, and what frames' rotations leave of the gyroscope's
 BIAS_STEP = 1e-4  # rad/s, for the change of P
 # Errors of the acceleration, m/s² and the seconds for which they stay: a tilt of .4° mixes .07 m/s² of gravity into it.
@@ -150,6 +153,7 @@ def scale_of_motion(
     arms = poses[:, :3, :3] @ -(T_imu_camera[:3, :3].T @ T_imu_camera[:3, 3])
     bias = _gyroscope_bias(dense, frames, rotations)
     turns = [_turned(dense, bias + step) for step in (np.zeros(3), *(BIAS_STEP * np.eye(3)))]
+    _check_turns(rotations, turns[0][frames], parts, source)
     windows = [_window(dense, turns, frames[rows], poses[rows, :3, 3], rotations[rows], arms[rows]) for rows in parts]
     solved = _solve(windows)
     if solved is None:
@@ -207,6 +211,22 @@ def _gyroscope_bias(dense: Inertial, frames: np.ndarray, rotations: Rotation) ->
         too_far = (rotations[:-1].inv() * rotations[1:]).inv() * (turned[:-1].inv() * turned[1:])
         bias = bias + too_far.as_rotvec()[near].sum(axis=0) / seconds[near].sum()
     return bias
+
+
+def _check_turns(rotations: Rotation, turned: Rotation, parts: Sequence[np.ndarray], source: str) -> None:
+    """ValueError if the rates turn the windows' frames otherwise than their rotations: the scale would be anything."""
+
+    def spread(turns: Sequence[Rotation]) -> float:
+        squares = [(one.mean().inv() * one).magnitude() ** 2 for one in turns]
+        return float(np.degrees(np.sqrt(np.mean(np.concatenate(squares)))))
+
+    off, of = spread([rotations[rows] * turned[rows].inv() for rows in parts]), spread([rotations[r] for r in parts])
+    if off > max(MAX_TURNED_OFF[0], MAX_TURNED_OFF[1] * of):
+        raise ValueError(
+            f"{source}: the frames turn by {of:.0f}° and the rates otherwise, by {off:.0f}°: check that T_imu_camera "
+            "turns the camera's axes into the unit's (its inverse, unit → camera, is what Kalibr writes), that rates "
+            "are in rad/s, and that both have one clock"
+        )
 
 
 def _window(

@@ -15,12 +15,21 @@ from emgs_jax.ops.ranges import number
 from emgs_jax.scale.estimate import Scale, combined, scale_from
 from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_of, surfaces_of
 from emgs_jax.scale.inertial import Inertial, read_inertial, scale_of_motion
-from emgs_jax.scale.positions import positions_of_exif, positions_of_poses, read_positions, scale_of_positions
+from emgs_jax.scale.positions import (
+    is_geographic,
+    positions_of_exif,
+    positions_of_poses,
+    read_positions,
+    scale_of_positions,
+)
 from emgs_jax.scale.tape import pixel_in, point_at, scale_of_distance, spread_of
 from emgs_jax.scale.up import up_of_cameras, up_of_surfaces
 
 NUM_VIEWS = 24  # frames in which a floor is looked for, evenly spread
 NUM_BESIDE = 8  # frames that are asked for a point's depth, evenly spread
+MAX_TILT_STD_DEG = 5.0  # of positions that tell up
+MAX_LEAN_DEG = 45.0  # between up by the cameras and the z axis of positions, which may have any axes
+MAX_ARM = 5.0  # metres between a camera and the unit beside it
 PIXELS = 60  # of a frame's longer side, whose surfaces are used
 
 
@@ -116,15 +125,18 @@ class Read(NamedTuple):
     """What the files of the sources hold; None for those that are not given."""
 
     positions: Float[np.ndarray, "n 3"] | None  # of all frames
+    is_z_up: bool  # of the positions, for sure
     inertial: Inertial | None
     T_imu_camera: Float[np.ndarray, "4 4"] | None
 
 
 def _read(config: ScaleConfig, dataset: Dataset) -> Read:
-    positions = None if config.positions is None else _positions(config.positions, dataset)
+    given = config.positions
+    positions = None if given is None else _positions(given, dataset)
+    is_z_up = given == "exif" or (given not in (None, "dataset") and is_geographic(Path(given).expanduser()))
     if config.imu is None:
-        return Read(positions, None, None)
-    return Read(positions, read_inertial(config.imu), _mounted(config))
+        return Read(positions, is_z_up, None, None)
+    return Read(positions, is_z_up, read_inertial(config.imu), _mounted(config))
 
 
 def _of_world(
@@ -166,8 +178,15 @@ def _of_world(
             notes.append(str(error))
         else:
             scales.append(placed.scale)
-            up = placed.T_metres_world.rotation.T @ np.array([0.0, 0.0, 1.0])
             notes.append(f"{placed.num_used} positions fit within {placed.residual:.2g} m")
+            z = placed.T_metres_world.rotation.T @ np.array([0.0, 0.0, 1.0])
+            is_up = read.is_z_up or z @ up_of_cameras(poses[:, :3, :3]) > np.cos(np.radians(MAX_LEAN_DEG))
+            if placed.tilt_std_deg > MAX_TILT_STD_DEG:
+                notes.append("they lie along a line, which leaves up open")
+            elif not is_up:
+                notes.append("their z axis is not up for the cameras, so they leave up open")
+            else:
+                up = z
     if read.inertial is not None:
         times = np.array([dataset[int(frame)].timestamp for frame in frames])
         try:
@@ -247,9 +266,10 @@ def _positions(given: str, dataset: Dataset) -> Float[np.ndarray, "n 3"]:
 def _mounted(config: ScaleConfig) -> Float[np.ndarray, "4 4"]:
     """T_imu_camera as a matrix."""
     given = config.T_imu_camera
-    if isinstance(given, str):
-        return read_sensor(Path(given).expanduser())[1]
-    T = np.asarray(given, np.float64)
+    T = read_sensor(Path(given).expanduser())[1] if isinstance(given, str) else np.asarray(given, np.float64)
     if T.size != 16 or not np.allclose(T.reshape(4, 4)[:3, :3] @ T.reshape(4, 4)[:3, :3].T, np.eye(3), atol=1e-3):
         raise ValueError(f"scale.T_imu_camera must be the 16 numbers of a rigid motion, row by row, got {given}")
+    arm = float(np.linalg.norm(T.reshape(4, 4)[:3, 3]))
+    if arm > MAX_ARM:
+        raise ValueError(f"scale.T_imu_camera: the camera is {arm:.3g} m from the unit: its translation is in metres")
     return T.reshape(4, 4)

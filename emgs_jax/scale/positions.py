@@ -11,7 +11,7 @@ from PIL import ExifTags, Image
 
 from emgs_jax.data.camera_models import load_pycolmap
 from emgs_jax.data.timestamps import in_seconds, nearest_rows
-from emgs_jax.geometry import Sim3
+from emgs_jax.geometry import Sim3, similarity_of
 from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.lines import numbers_in, words_of
 
@@ -30,6 +30,7 @@ class Placed(NamedTuple):
     T_metres_world: Sim3
     residual: float  # metres, root mean square of the positions that count
     num_used: int
+    tilt_std_deg: float  # of the z axis of the positions, in the world; large where they lie on a level line
 
 
 def positions_of_exif(files: Sequence[Path | None]) -> Float[np.ndarray, "n 3"]:
@@ -95,6 +96,11 @@ def _in_metres(geographic: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]
     found = np.full(geographic.shape, np.nan)
     found[is_known] = _pycolmap().GPSTransform().ellipsoid_to_enu(geographic[is_known], *geographic[is_known][0])
     return found
+
+
+def is_geographic(path: Path) -> bool:
+    """Whether a file of positions has longitude, latitude and altitude: then z is up, and in others it may not be."""
+    return next((words[0].upper() == GEOGRAPHIC for _, _, words in words_of(path)), False)
 
 
 def read_positions(path: Path, names: Sequence[str], times: Sequence[float]) -> Float[np.ndarray, "n 3"]:
@@ -163,18 +169,16 @@ def scale_of_positions(centers: Float[np.ndarray, "n 3"], positions: Float[np.nd
     Raises:
         ValueError: too few positions, or they lie no farther apart than they err.
     """
-    pycolmap = _pycolmap()
     is_known = np.isfinite(centers).all(axis=1) & np.isfinite(positions).all(axis=1)
     if is_known.sum() < MIN_POSITIONS:
         raise ValueError(
             f"{source}: {is_known.sum()} frames have a pose and a position, and {MIN_POSITIONS} are needed"
         )
     used = is_known
+    if not np.ptp(centers[used], axis=0).any():
+        raise ValueError(f"{source}: the path does not move, so positions tell no scale")
     for _ in range(NUM_STEPS):
-        found = pycolmap.estimate_sim3d(centers[used], positions[used])
-        if found is None:
-            break
-        similarity = Sim3(found.scale, found.rotation.matrix(), np.asarray(found.translation))
+        similarity = similarity_of(centers[used], positions[used])
         off = np.linalg.norm(similarity.apply(centers) - positions, axis=1)
         std = 1.4826 * float(np.median(off[is_known]))
         near = is_known & (off <= max(MAX_OFF * std, 1e-9))
@@ -183,7 +187,7 @@ def scale_of_positions(centers: Float[np.ndarray, "n 3"], positions: Float[np.nd
         used = near
     apart = positions[used] - positions[used].mean(axis=0)
     spread = float(np.sqrt(np.sum(apart**2)))
-    if found is None or not spread > 0:
+    if not spread > 0:
         raise ValueError(f"{source}: the positions do not move, so they tell no scale")
     residual = float(np.sqrt(np.mean(off[used] ** 2)))
     degrees = max(3 * int(used.sum()) - 7, 1)
@@ -194,4 +198,18 @@ def scale_of_positions(centers: Float[np.ndarray, "n 3"], positions: Float[np.nd
             f"{source}: positions are off by {residual:.2g} m and lie {apart_by:.2g} m from their middle, so they "
             "tell no scale: are they of these images, and in metres?"
         )
-    return Placed(Scale(source, float(np.log(similarity.scale)), max(std, 1e-6)), similarity, residual, int(used.sum()))
+    scale = Scale(source, float(np.log(similarity.scale)), max(std, 1e-6))
+    tilt_std = _tilt_std(similarity.apply(centers[used]), std * spread)
+    return Placed(scale, similarity, residual, int(used.sum()), tilt_std)
+
+
+def _tilt_std(path: Float[np.ndarray, "n 3"], std: float) -> float:
+    """Standard deviation in degrees of the z axis of positions by which a path y is turned, each with `std`.
+
+    A turn w moves it by w × y, so its information is Σ (|y|² I - y yᵀ) / std², from the middle; it moves the z axis by
+    w × z. Positions themselves lie beside a line by their errors.
+    """
+    apart = path - path.mean(axis=0)
+    known = np.sum(apart**2) * np.eye(3) - apart.T @ apart
+    covariance = std**2 * np.linalg.inv(known + 1e-12 * np.trace(known) * np.eye(3))
+    return float(np.degrees(np.sqrt(covariance[0, 0] + covariance[1, 1])))

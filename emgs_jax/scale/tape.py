@@ -45,9 +45,11 @@ def point_at(
         pixel: column and row.
 
     Returns:
-        None where no depth is known near the pixel.
+        None where no depth is known near the pixel, or outside of the frame.
     """
     column, row = np.rint(pixel).astype(int)
+    if not (0 <= row < len(points) and 0 <= column < points.shape[1]):
+        return None
     near = slice(max(row - REACH, 0), row + REACH + 1), slice(max(column - REACH, 0), column + REACH + 1)
     some, stds = points[near].reshape(-1, 3), std[near].reshape(-1)
     stds, some = stds[some[:, 2] > 0], some[some[:, 2] > 0].astype(np.float64)

@@ -237,7 +237,7 @@ def find_models(shots: Shots, config: StructureConfig, folder: Path, start: int 
 
 def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) -> None:
     """Register remaining images with fewer inliers."""
-    cache, names = _cache(config, folder)
+    cache, names = cache_of(config, folder)
     placed = {image for model in models for image in model.reg_image_ids()}
     options = load().IncrementalMapperOptions(
         abs_pose_min_num_inliers=config.min_inliers,
@@ -257,7 +257,7 @@ def register_rest(models: Sequence[Any], config: StructureConfig, folder: Path) 
 
 def triangulate(model: Any, config: StructureConfig, folder: Path) -> None:
     """Find points again that a model lacks."""
-    mapper = load().IncrementalMapper(_cache(config, folder)[0])
+    mapper = load().IncrementalMapper(cache_of(config, folder)[0])
     mapper.begin_reconstruction(model)
     _triangulate(mapper, sorted(model.reg_image_ids()), config)
     mapper.end_reconstruction(False)
@@ -268,7 +268,7 @@ def _triangulate(mapper: Any, images: Sequence[int], config: StructureConfig) ->
         mapper.triangulate_image(load().IncrementalTriangulatorOptions(random_seed=config.seed), image)
 
 
-def _cache(config: StructureConfig, folder: Path) -> tuple[Any, dict[int, str]]:
+def cache_of(config: StructureConfig, folder: Path) -> tuple[Any, dict[int, str]]:
     """A folder's database in memory, and the names of its images."""
     pycolmap = load()
     with pycolmap.Database.open(folder / DATABASE) as opened:
@@ -284,7 +284,7 @@ def adjust(model: Any, shots: Shots, config: StructureConfig) -> None:
     """
     drop_points_at_cameras(model)
     _solve(model, shots, config, refined_lens(shots, config)[0] and model.num_reg_images() >= MIN_FOR_CENTER)
-    _filter(model, config)
+    filter_points(model, config)
     model.update_point_3d_errors()
 
 
@@ -292,16 +292,25 @@ def settle(model: Any, shots: Shots, config: StructureConfig) -> None:
     """Adjust a model that is far from its optimum."""
     drop_points_at_cameras(model)
     _solve(model, shots, config, is_center_free=False)
-    _filter(model, config, WIDE)
+    filter_points(model, config, WIDE)
     _solve(model, shots, config, is_center_free=False)
-    _filter(model, config)
+    filter_points(model, config)
 
 
 def _solve(model: Any, shots: Shots, config: StructureConfig, is_center_free: bool) -> None:
     """Minimise a robust loss."""
-    pycolmap, (is_free, is_bent) = load(), refined_lens(shots, config)
+    pycolmap = load()
     if not model.num_points3D():
         return
+    options = adjustment(shots, config, is_center_free)
+    problem = bundle_of(model)  # `pycolmap.bundle_adjustment` prints whatever the level of the log
+    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    pycolmap.create_default_ceres_bundle_adjuster(options, problem, model).solve()
+
+
+def adjustment(shots: Shots, config: StructureConfig, is_center_free: bool) -> Any:
+    """pycolmap's options of an adjustment with a robust loss."""
+    is_free, is_bent = refined_lens(shots, config)
     refined = {
         "refine_focal_length": is_free,
         "refine_principal_point": is_center_free,
@@ -309,14 +318,12 @@ def _solve(model: Any, shots: Shots, config: StructureConfig, is_center_free: bo
         "print_summary": False,
     }
     options = options_of("BundleAdjustmentOptions", refined)
-    options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    options.ceres.loss_function_type = load().LossFunctionType.CAUCHY
     options.ceres.solver_options.num_threads = config.num_threads
-    problem = bundle_of(model)  # `pycolmap.bundle_adjustment` prints whatever the level of the log
-    problem.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    pycolmap.create_default_ceres_bundle_adjuster(options, problem, model).solve()
+    return options
 
 
-def _filter(model: Any, config: StructureConfig, factor: float = 1.0) -> None:
+def filter_points(model: Any, config: StructureConfig, factor: float = 1.0) -> None:
     """Drop what the robust loss may have moved anywhere; `factor` multiplies the largest error."""
     filters = options_of("IncrementalPipelineOptions", config.options.get("incremental", {})).mapper
     observations = load().ObservationManager(model)

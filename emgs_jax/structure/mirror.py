@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from emgs_jax.geometry import nearest_rotation
 from emgs_jax.structure.evidence import Evidence, explained
 from emgs_jax.structure.library import load
 
@@ -47,8 +48,7 @@ def mirrored(model: Any) -> Any:
 
 def mean_rotation(poses: list[np.ndarray]) -> np.ndarray:
     """The rotation nearest to the mean of the poses' (3, 4)."""
-    U, _, Vt = np.linalg.svd(np.sum([pose[:, :3] for pose in poses], axis=0))
-    return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
+    return nearest_rotation(np.sum([pose[:, :3] for pose in poses], axis=0))
 
 
 def center_of(model: Any) -> np.ndarray:

@@ -12,6 +12,7 @@ from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.library import check_kinds, load, member, options_of
 from emgs_jax.structure.mapping import Mapped, map_database
 from emgs_jax.structure.pairs import choose_pairs
+from emgs_jax.structure.posed import model_at
 from emgs_jax.structure.shots import DATABASE, IMAGES, Shots
 
 BATCH, PAIRS = 8, 400  # images and pairs of one call of COLMAP, so that the bar moves
@@ -25,7 +26,8 @@ def map_images(shots: Shots, config: StructureConfig, folder: Path) -> Mapped:
     _say(shots, config)
     detect(shots, config, folder)
     match(shots, config, folder)
-    return map_database(shots, config, folder)
+    found = None if shots.poses is None else model_at(shots, config, folder)
+    return found or map_database(shots, config, folder)
 
 
 def _say(shots: Shots, config: StructureConfig) -> None:

@@ -24,18 +24,26 @@ WAITING_S = 0.3  # between images of a camera before the structure begins
 ESTIMATED = "structure"  # in a data set's calibration: key of the structure that its camera is from
 
 
-def structure_of(dataset: Dataset, config: StructureConfig, folder: Path | None) -> tuple[Structure, bool]:
-    """The structure of a data set, kept in `folder`, and True if its images are undistorted, whatever the lens."""
+def structure_of(
+    dataset: Dataset, config: StructureConfig, folder: Path | None, at_poses: bool = False
+) -> tuple[Structure, bool]:
+    """The structure of a data set, kept in `folder`, and True if its images are undistorted, whatever the lens.
+
+    Args:
+        at_poses: the data set's poses, in metres, are those of the structure, up to their errors.
+    """
     names = names_of(dataset)
     key = dataset.calibration.get(ESTIMATED)
-    if key is not None and (models := models_of(key, folder)) is not None:
+    if key is not None and not at_poses and (models := models_of(key, folder)) is not None:
         return to_structure(models, names, config), True
     read, size, intrinsics = full_images(dataset)
     # A model that is given is of the images on disk, which the data set may have straightened.
     is_straight = config.model is not None and any(dataset.calibration.get("distortion") or ())
     camera = of_calibration(dataset.calibration, size) if is_straight else pinhole_of(intrinsics, config)
     masks = getattr(dataset, "full_mask", None)
-    shots = Shots(names, read, size, camera, is_calibrated=True, mask=masks)
+    poses = [dataset.pose(index) for index in range(len(dataset))] if at_poses else None
+    known = None if poses is None else np.stack([np.full((4, 4), np.nan) if T is None else T for T in poses])
+    shots = Shots(names, read, size, camera, is_calibrated=True, mask=masks, poses=known)
     _, models = make_models(shots, config, folder)
     return to_structure(models, names, config), is_straight
 

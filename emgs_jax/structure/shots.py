@@ -17,3 +17,4 @@ class Shots(NamedTuple):
     camera: tuple[str, tuple[float, ...]]  # COLMAP's model, and parameters in its pixels, or none: its default start
     is_calibrated: bool  # only the distortion may still change
     mask: Callable[[int], np.ndarray | None] = lambda _: None  # bool (h, w), True where an image is left out
+    poses: np.ndarray | None = None  # (n, 4, 4) T_world_camera in metres, NaN without one, at which a model is made

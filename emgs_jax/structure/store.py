@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from tqdm import tqdm
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.masks import stem
 from emgs_jax.io.files import write_file
-from emgs_jax.structure import evidence, mapping, mirror, reconstruct
+from emgs_jax.structure import evidence, mapping, mirror, posed, reconstruct
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import given_models, read_models, stems_of
 from emgs_jax.structure.library import load
@@ -36,6 +37,8 @@ def key_of(shots: Shots, config: StructureConfig) -> str:
     settings = {name: value for name, value in asdict(config).items() if name not in NOT_OF_MODELS}
     settings["masks"] = config.masks.fingerprint()
     about = [settings, shots.camera, shots.is_calibrated, [*shots.names], load().__version__, VERSION, _constants()]
+    if shots.poses is not None:
+        about += [shots.poses.tolist(), *_constants_of(posed).items()]
     digest = hashlib.blake2b(json.dumps(about, sort_keys=True, default=str).encode(), digest_size=16)
     for index in range(len(shots.names)):
         try:
@@ -49,7 +52,10 @@ def key_of(shots: Shots, config: StructureConfig) -> str:
 
 def _constants() -> dict[str, Any]:
     """The numbers that models are made with, and nobody sets."""
-    modules = evidence, mapping, mirror, reconstruct
+    return _constants_of(evidence, mapping, mirror, reconstruct)
+
+
+def _constants_of(*modules: ModuleType) -> dict[str, Any]:
     return {name: value for module in modules for name, value in vars(module).items() if name.isupper()}
 
 

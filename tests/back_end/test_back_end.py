@@ -24,6 +24,7 @@ from emgs_jax.back_end.factors import (
 )
 from emgs_jax.back_end.loops import (
     consistent_loops,
+    detect_loops,
     is_closure_due,
     not_in_graph,
     query_prior,
@@ -47,7 +48,8 @@ from emgs_jax.gaussian_map import new_map
 from emgs_jax.geometry import Sim3, scale_pose
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe
 from emgs_jax.loop_closure.prior_query import JointPrediction
-from emgs_jax.loop_closure.verification import LoopMeasurement
+from emgs_jax.loop_closure.two_view_alignment import Gate
+from emgs_jax.loop_closure.verification import LoopMeasurement, VerifyInfo
 from emgs_jax.mapping import integrate
 from emgs_jax.mapping.atlas import Atlas, Submap, World
 from emgs_jax.mapping.event import Event
@@ -444,6 +446,24 @@ def with_keyframes(end: BackEnd) -> BackEnd:
     wall = np.full((60, 80), 2.0, np.float32)
     keyframes = tuple(Keyframe(row, *none, end.intrinsics, (64, 48), wall) for row in range(len(end.poses)))
     return replace(end, database=Database(keyframes))
+
+
+def test_a_place_where_a_map_begins_is_confirmed_by_the_two_keyframes_after_it(graph, monkeypatch):
+    """The frame that opens the map is no keyframe, and beside the second one there are none before it."""
+    asked, nothing = [], np.zeros((4, 4, 3), np.uint8)
+
+    def note(query, candidate, neighbours, config):
+        asked.append((query.frame, candidate.frame, [one.keyframe.frame for one in neighbours]))
+        return None, VerifyInfo(Gate.MATCHES, 0.0)
+
+    monkeypatch.setattr(back_end.loops, "verify", note)
+    monkeypatch.setattr(back_end.loops, "propose_candidates", lambda database, row, config: [*range(row - 2)])
+    end, poses = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01), ring()
+    for index in range(7):
+        seen = replace(look(poses, index), image=nothing)
+        end = detect_loops(add_node(end, seen, poses[index], 1.0, None), seen)
+    assert [one.frame for one in end.database.keyframes] == [*range(1, 7)]
+    assert asked[-3:] == [(6, 1, [2, 3]), (6, 2, [1, 3]), (6, 3, [2, 4])]
 
 
 @pytest.fixture

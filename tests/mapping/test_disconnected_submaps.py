@@ -115,7 +115,7 @@ def test_of_parts_that_never_meet_the_one_with_most_placed_frames_is_the_map(tmp
     assert len(births) > 0 and set(births) <= set(kept)
     assert [node.is_placed for node in run.back_end.nodes] == [row in kept for row in range(len(numbers))]
     assert {edge.a for edge in run.back_end.factors} <= set(kept)
-    assert {one.frame for one in run.back_end.database.keyframes} == set(kept)
+    assert {one.frame for one in run.back_end.database.keyframes} == set(kept[1:])  # the first opened the map
     save_progress(tmp_path, run)
     lines = (tmp_path / "frames.jsonl").read_text().splitlines()
     assert "skipped" in lines[0]

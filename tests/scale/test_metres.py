@@ -141,6 +141,31 @@ def test_poses_of_the_data_set_give_scale_and_up(tmp_path):
     assert "11 positions fit" in found.notes[0]
 
 
+def test_positions_in_a_world_whose_z_axis_is_not_up_leave_up_open(tmp_path):
+    """Symptom: up of poses by ARKit, whose y axis is up, or of odometry, whose z axis is ahead, lay on its side."""
+    dataset = Photos(tmp_path)
+    for turned in ([[1, 0, 0], [0, 0, 1], [0, -1, 0]], [[1, 0, 0], [0, -1, 0], [0, 0, -1]]):  # y up; z down
+        T = np.eye(4)
+        T[:3, :3] = turned
+        dataset.name, dataset.pose = "photos", lambda index, T=T: T @ poses()[index]
+        (found,) = metres_of(ScaleConfig(positions="dataset"), dataset, *structure(), view)
+        assert found.up is None and any("leave up open" in note for note in found.notes)
+        assert found.scale.factor == pytest.approx(1 / UNIT, rel=1e-4)
+
+
+def test_positions_along_a_line_leave_up_open(tmp_path):
+    """Symptom: of a straight walk, up was turned about it by any angle."""
+    path, rng = tmp_path / "places.txt", np.random.default_rng(0)
+    T, world = structure()
+    line = np.stack([0.5 * np.arange(COUNT), np.zeros(COUNT), np.full(COUNT, HEIGHT)], axis=1)
+    T[:, :3, 3] = UNIT * (line + 1e-3 * rng.normal(size=line.shape)) @ TURN.T
+    places = line + 0.02 * rng.normal(size=line.shape)
+    path.write_text("".join(f"a{row:02}.jpg {' '.join(map(str, place))}\n" for row, place in enumerate(places)))
+    (found,) = metres_of(ScaleConfig(positions=str(path)), Photos(tmp_path), T, world, view)
+    assert found.up is None and "they lie along a line, which leaves up open" in found.notes
+    assert found.scale.factor == pytest.approx(1 / UNIT, rel=0.02)
+
+
 def test_sources_that_disagree_are_said(tmp_path):
     length = tape()[-1]
     (found,) = measured(tmp_path, ScaleConfig(distance=tape(metres=2 * length), height=HEIGHT))
@@ -216,6 +241,14 @@ def test_an_extrinsic_that_is_no_rigid_motion_is_named(tmp_path):
     path.write_text("\n".join(f"{0.005 * row} .1 0 0 0 0 9.81" for row in range(4000)))
     with pytest.raises(ValueError, match=r"scale.T_imu_camera must be the 16 numbers"):
         measured(tmp_path, ScaleConfig(imu=str(path), T_imu_camera=[1.0] * 16))
+
+
+def test_an_arm_in_millimetres_is_named(tmp_path):
+    path, mounted = tmp_path / "imu.txt", np.eye(4)
+    path.write_text("\n".join(f"{0.005 * row} .1 0 0 0 0 9.81" for row in range(4000)))
+    mounted[:3, 3] = [30.0, 0.0, -80.0]
+    with pytest.raises(ValueError, match=r"85.4 m from the unit: its translation is in metres"):
+        measured(tmp_path, ScaleConfig(imu=str(path), T_imu_camera=mounted.ravel()))
 
 
 def test_a_prior_with_a_unit_of_its_own_takes_no_scale_and_one_from_images_alone_does():

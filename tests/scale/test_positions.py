@@ -120,6 +120,17 @@ def test_a_path_is_aligned_without_the_positions_that_are_wrong():
     assert placed.T_metres_world.rotation == pytest.approx(turn.T, abs=0.01)
 
 
+@pytest.mark.parametrize("level", [[1, 1, 0], [1, 0, 0]])
+def test_positions_in_a_plane_or_on_a_line_tell_the_scale(level):
+    """Symptom: pycolmap finds no similarity to positions of rank 2, as of a robot on wheels: they "do not move"."""
+    rng = np.random.default_rng(0)
+    positions = np.cumsum(rng.normal(size=(30, 3)), axis=0) * level
+    centers = 0.4 * positions @ Rotation.random(random_state=3).as_matrix() + 0.001 * rng.normal(size=(30, 3))
+    placed = scale_of_positions(centers, positions, "positions")
+    assert placed.scale.factor == pytest.approx(2.5, rel=0.002)
+    assert (placed.tilt_std_deg > 5) == (sum(level) == 1)
+
+
 def test_the_scale_of_positions_is_calibrated():
     off = []
     for seed in range(200):
@@ -127,6 +138,22 @@ def test_the_scale_of_positions_is_calibrated():
         scale = scale_of_positions(centers, positions, "positions").scale
         off.append((scale.log - np.log(2.5)) / scale.std)
     assert 0.8 < np.std(off) < 1.25
+
+
+def test_the_tilt_of_positions_is_calibrated_and_large_along_a_level_line():
+    off, said = [], []
+    for seed in range(200):
+        centers, positions, turn = path_and_positions(np.random.default_rng(seed), 0.3)
+        placed = scale_of_positions(centers, positions, "positions")
+        z = placed.T_metres_world.rotation @ turn[:, 2]
+        off.append(np.degrees(np.arccos(z[2])))
+        said.append(placed.tilt_std_deg)
+    assert np.sqrt(np.mean(np.square(off))) == pytest.approx(np.sqrt(np.mean(np.square(said))), rel=0.2)
+    rng = np.random.default_rng(0)
+    bent, noise = 0.001 * rng.normal(size=(20, 3)), 0.01 * rng.normal(size=(20, 3))
+    for line, low, high in (([1.0, 0.5, 0.0], 20, 1e9), ([0.0, 0.0, 1.0], 0, 0.1)):  # a turn about z leaves it
+        path = np.outer(np.arange(20.0), line) + bent
+        assert low < scale_of_positions(path, path + noise, "positions").tilt_std_deg < high
 
 
 def test_positions_of_something_else_tell_no_scale():

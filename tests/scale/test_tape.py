@@ -57,6 +57,14 @@ def test_no_depth_near_a_pixel_is_no_point():
     assert point_at(np.zeros((20, 30, 3)), np.ones((20, 30)), np.array([3.0, 3.0])) is None
 
 
+@pytest.mark.parametrize("pixel", [(-9.0, 5.0), (5.0, -9.0), (30.0, 5.0), (5.0, 20.0)])
+def test_no_pixel_of_the_frame_is_no_point(pixel):
+    """Symptom: far above or left of a frame it was the median of nearly all of it."""
+    points = np.full((20, 30, 3), 2.0)
+    assert point_at(points, np.ones((20, 30)), np.array(pixel)) is None
+    assert point_at(points, np.ones((20, 30)), np.array([-0.25, 19.4])) is not None
+
+
 def test_a_point_is_seen_where_the_camera_looks():
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [1.0, 0.0, 0.5]  # looks along the world's x

@@ -88,6 +88,8 @@ class MultiviewStereo(Prior):
             settings["unit"] = "m"
         if metres.is_given:
             settings["scale"] = jsonable(asdict(metres))
+        if metres.positions == "dataset" and structure.model is None:
+            settings["poses"] = "dataset"
         self.provenance = Provenance("multiview_stereo", {"version": 14} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
@@ -220,7 +222,8 @@ class MultiviewStereo(Prior):
         if self._config.model is not None:
             names = names_at(Path(self._config.model).expanduser())
             check_names(self._dataset, names, f"prior.structure.model={self._config.model}")
-        found, is_straight = structure_of(self._dataset, self._config, self._folder)
+        at_poses = self._metres.positions == "dataset"
+        found, is_straight = structure_of(self._dataset, self._config, self._folder, at_poses)
         return lambda frame: found, is_straight
 
     def _to_metres(self, found: Structure, scales: Sequence[Scale | None]) -> None:

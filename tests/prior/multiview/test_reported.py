@@ -68,3 +68,13 @@ def test_frames_of_a_doubtful_model_are_counted(tmp_path, doubtful, percent):
     assert begun(tmp_path).report().get("prior/doubtful_percent") == percent
     given = begun(tmp_path, "prior.structure.model=elsewhere")
     assert "prior/doubtful_percent" not in given.report()
+
+
+def test_a_structure_is_made_at_the_poses_of_the_data_set_if_these_are_the_positions(tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "structure_of", lambda *given: asked.append(given[-1]) or (drawn(), False))
+    for words in ((), ("scale.positions=exif",), ("scale.positions=dataset",)):
+        prior = begun(tmp_path, *words)
+        prior._begin()
+        is_at_poses = words == ("scale.positions=dataset",)
+        assert asked.pop() is is_at_poses and (prior.provenance.settings.get("poses") == "dataset") is is_at_poses
