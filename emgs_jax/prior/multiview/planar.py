@@ -2,9 +2,9 @@
 
 On a blank wall the matching costs are flat, and semi-global aggregation extends the depth of its border parallel to the
 image. But blank regions of rooms are mostly planes with well matched borders, so each gets the plane of most of its
-confident matches, if these are enough (planar priors: Gallup, Frahm and Pollefeys, CVPR 2010; Xu and Tao, AAAI 2020).
-A plane's inverse depth is linear in the pixel, 1/z = p · (u, v, 1): RANSAC and least squares find it, and its
-uncertainty is that of their prediction.
+confident matches, if these are enough, or a few planes (planar priors: Gallup, Frahm and Pollefeys, CVPR 2010; Xu and
+Tao, AAAI 2020). A plane's inverse depth is linear in the pixel, 1/z = p · (u, v, 1): RANSAC and least squares find it,
+and its uncertainty is that of their prediction.
 """
 
 from collections.abc import Iterator
@@ -15,6 +15,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from emgs_jax.ops.ranges import number
+
+MAX_PLANES = 4  # of a region
 
 
 @dataclass(frozen=True)
@@ -27,7 +29,7 @@ class PlanarConfig:
     max_spread: float = number(1.2, low=0)  # of a match, in planes of the sweep
     min_matches: int = number(50, low=3)  # of a region
     tolerance: float = number(1.0, low=0)  # distance of a supporting match from the plane, in planes of the sweep
-    min_share: float = number(0.75, low=0, high=1)  # of a region's matches that must support its plane
+    min_share: float = number(0.75, low=0, high=1)  # of a region's matches that must support its planes
     num_draws: int = number(64, low=1, high=1e6)  # of three matches, by RANSAC
     correlation: float = number(5.0, low=0)  # length over which matches err alike, pixels
 
@@ -69,6 +71,57 @@ def _prediction_std(
     return np.sqrt(variance * (1.0 + np.einsum("mi,ij,mj->m", at, np.linalg.inv(hessian), at)))
 
 
+def fit_planes(
+    pixels: Float[np.ndarray, "n 3"], inverse: Float[np.ndarray, "n"], config: PlanarConfig
+) -> list[tuple[Float[np.ndarray, "3"], Bool[np.ndarray, "n"]]]:
+    """Find the planes of a region's matches, and the matches of each; none if they lie on no planes.
+
+    The first plane has most of the matches. If it has less than `min_share` of them (a ceiling and its beam, two walls
+    of one paint), the next one has most of those that are left, until together they have that share.
+    """
+    found, is_left = [], np.ones(len(pixels), bool)
+    while len(found) < MAX_PLANES and is_left.sum() >= config.min_matches:
+        plane, chosen = fit_plane(pixels[is_left], inverse[is_left], config)
+        if chosen.sum() < config.min_matches:
+            break
+        of_plane = np.zeros(len(pixels), bool)
+        of_plane[is_left] = chosen
+        found, is_left = [*found, (plane, of_plane)], is_left & ~of_plane
+        if np.mean(~is_left) >= config.min_share:
+            return found
+    return []
+
+
+def _filled(
+    region: Bool[np.ndarray, "h w"],
+    near: Bool[np.ndarray, "h w"],
+    pixels: Float[np.ndarray, "h w 3"],
+    inverse: Float[np.ndarray, "h w"],
+    config: PlanarConfig,
+) -> tuple[Float[np.ndarray, "m"], Float[np.ndarray, "m"]] | None:
+    """Inverse depth and its standard deviation in a region, by the planes of its matches `near`; None without a plane.
+
+    A pixel lies on the plane of the nearest match, most likely: where its nearest matches on plane k are d_k away, that
+    plane has the probability p_k, proportional to 1 / d_k². The variance is that about the likeliest plane, so it is
+    large between two planes that do not meet.
+    """
+    planes = fit_planes(pixels[near], inverse[near], config)
+    if not planes:
+        return None
+    values, stds, distances = [], [], []
+    for plane, chosen in planes:
+        errors = (pixels[near] @ plane - inverse[near])[chosen]
+        values.append(pixels[region] @ plane)
+        stds.append(_prediction_std(pixels[region], pixels[near][chosen], errors, config))
+        is_off = np.ones(region.shape, np.uint8)
+        is_off[near] = ~chosen
+        distances.append(cv2.distanceTransform(is_off, cv2.DIST_L2, cv2.DIST_MASK_PRECISE)[region])
+    shares = np.maximum(distances, 0.5) ** -2.0  # pixels; a match is its own plane's for sure
+    shares, nearest = shares / shares.sum(axis=0), np.argmin(distances, axis=0)
+    found = np.take_along_axis(np.stack(values), nearest[None], axis=0)[0]
+    return found, np.sqrt(np.sum(shares * (np.square(stds) + (values - found) ** 2), axis=0))
+
+
 def fill_planes(
     depth: Float[np.ndarray, "h w"],
     spread: Float[np.ndarray, "h w"],
@@ -76,7 +129,7 @@ def fill_planes(
     spacing: float,
     config: PlanarConfig,
 ) -> tuple[Float[np.ndarray, "h w"], Float[np.ndarray, "h w"]]:
-    """Depth (0 where unknown) and spread, replaced by those of a blank region's plane where it is more certain.
+    """Depth (0 where unknown) and spread, replaced by those of a blank region's planes where these are more certain.
 
     Spreads are in planes of the sweep, which are `spacing` (1/m) apart.
     """
@@ -90,11 +143,10 @@ def fill_planes(
         near = is_match & region
         if near.sum() < config.min_matches:
             continue
-        plane, chosen = fit_plane(pixels[near], inverse[near], config)
-        if chosen.mean() < config.min_share:
+        filled_in = _filled(region, near, pixels, inverse, config)
+        if filled_in is None:
             continue
-        found, errors = pixels[region] @ plane, (pixels[near] @ plane - inverse[near])[chosen]
-        std = _prediction_std(pixels[region], pixels[near][chosen], errors, config)
+        found, std = filled_in
         better = (std < certain[region]) & (found > 0)
         filled[region] = np.where(better, found, filled[region])
         certain[region] = np.where(better, std, certain[region])

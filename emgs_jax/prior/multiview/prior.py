@@ -90,7 +90,7 @@ class MultiviewStereo(Prior):
             settings["scale"] = jsonable(asdict(metres))
         if metres.positions == "dataset" and structure.model is None:
             settings["poses"] = "dataset"
-        self.provenance = Provenance("multiview_stereo", {"version": 14} | settings)
+        self.provenance = Provenance("multiview_stereo", {"version": 15} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
         self._up_to: Callable[[int], Structure] | None = None  # of the frames up to this one, at least
