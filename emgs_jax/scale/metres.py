@@ -41,7 +41,8 @@ class ScaleConfig:
     # they show
     distance: Sequence[Any] | None = None
     height: float | None = number(None, low=1e-3, high=1e4)  # metres of the camera above the floor, in the median
-    # Of the cameras: exif (GPS of photos), dataset (its poses, in metres), or a file, see `read_positions`
+    # Of the cameras: exif (GPS of photos), dataset (its poses, in metres, at which a structure is made), or a file, see
+    # `read_positions`
     positions: str | None = None
     imu: str | None = None  # of an inertial measurement unit, see `read_inertial`
     # camera → unit: 16 numbers row by row, or a sensor.yaml of the camera as EuRoC has
