@@ -183,7 +183,7 @@ def update_existence(
     existence = jnp.clip(map.existence + change, -config.max_log_odds, config.max_log_odds)
     existence = jnp.where(change == 0, map.existence, existence)
 
-    motion = T_world_previous.inverse() @ T_world_camera
+    motion = jax.lax.stop_gradient(T_world_previous.inverse() @ T_world_camera)  # of which views are counted
     turn, shift = (jnp.linalg.norm(part) for part in (motion.rotation().log(), motion.translation()))
     share = jnp.minimum((turn + shift / jnp.maximum(sight.depth, NEAREST_DEPTH)) / VIEW, 1.0)
     num_through = _views_through(map.num_through, share, sight, depths[0], camera)

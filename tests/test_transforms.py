@@ -89,7 +89,8 @@ class Verb:
     def differences(self):
         """For each array of results: weights of about one over its largest entry, and finite differences.
 
-        Both are 0 where the differences by two steps do not agree: such an entry is at a gate or at an edge.
+        Both are 0 where the differences by two steps do not agree, or steps to and fro lie on one side of the result:
+        such an entry is at a gate or at an edge, or neighbours have changed their order.
         """
         weights, slopes = [], []
         for x, *moved in zip(*map(numbers, (self.batch[0], *self.batch[2:])), strict=True):
@@ -97,6 +98,7 @@ class Verb:
             with np.errstate(invalid="ignore"):
                 large, small = ((moved[2 * i] - moved[2 * i + 1]).astype(float) / (2 * STEPS[i]) for i in (0, 1))
                 is_smooth = np.abs(large - small) <= 0.05 * np.abs(large) + 2e-3 * unit
+                is_smooth &= np.abs(0.5 * (moved[0] + moved[1]) - x) <= 1e-3 * unit
             slopes.append(np.where(is_smooth, large, 0.0))
             weights.append((is_smooth * np.cos(np.arange(x.size)).reshape(x.shape) / unit).astype(np.float32))
         return weights, slopes
