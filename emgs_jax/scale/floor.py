@@ -11,6 +11,7 @@ MIN_SHARE = 0.15  # of the largest level's area: what is lower than the floor is
 MIN_STD = 0.02  # of the logarithm of a height: the floor's own error
 TILT_DEG = 3.0  # standard deviation between up, as it was, and the normal of the floor
 MAX_OFF = 3.0  # standard deviations within which a patch is of the floor
+MAX_BEND = 0.025  # of a patch
 NUM_STEPS = 10  # of choosing the patches of the plane anew
 
 
@@ -36,21 +37,26 @@ def surfaces_of(
 ) -> Surfaces:
     """Return the patches of a frame, every `step` pixels.
 
-    A normal is the cross product of the differences to the pixels `step` to the right and below, where neither is more
-    than a twentieth farther or nearer.
+    A normal is the cross product of the differences between the pixels `step` to its sides, and above and below it. The
+    inverse depth of a plane is linear in the pixel, however slanted: where it departs from the mean of two opposite
+    ones by more than `MAX_BEND` of itself there is an edge, and no patch.
 
     Args:
         points: in the camera's axes, 0 where there is none.
     """
     sampled = points[::step, ::step].astype(np.float64)
-    here, right, below = sampled[:-1, :-1], sampled[:-1, 1:], sampled[1:, :-1]
-    z = np.stack([part[..., 2] for part in (here, right, below)])
-    is_known = (z > 0).all(axis=0) & (np.ptp(z, axis=0) <= 0.05 * z[0])
-    here, right, below = here[is_known], right[is_known], below[is_known]
-    crossed = np.cross(below - here, right - here)
+    here, middle = sampled[1:-1, 1:-1], slice(1, -1)
+    beside = [(sampled[middle, :-2], sampled[middle, 2:]), (sampled[:-2, middle], sampled[2:, middle])]
+    z, *opposite = (np.stack([part[..., 2] for part in parts]) for parts in ((here,), *beside))
+    is_known = (z[0] > 0) & (np.stack(opposite) > 0).all(axis=(0, 1))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        bends = [np.abs(z[0] * (0.5 / first + 0.5 / second) - 1.0) for first, second in opposite]
+    is_known &= np.max(bends, axis=0) <= MAX_BEND
+    across, down = (last[is_known] - first[is_known] for first, last in beside)
+    crossed, here = np.cross(down, across), here[is_known]
     length = np.linalg.norm(crossed, axis=1)
     is_one = length > 0
-    here, normals, areas = here[is_one], crossed[is_one] / length[is_one, None], length[is_one]
+    here, normals, areas = here[is_one], crossed[is_one] / length[is_one, None], 0.25 * length[is_one]
     rotation, center = T_world_camera[:3, :3], T_world_camera[:3, 3]
     return Surfaces(here @ rotation.T + center, normals @ rotation.T, areas, np.full(len(areas), frame))
 
