@@ -35,7 +35,11 @@ def up_of_surfaces(
     Args:
         up: unit vector, within about 20° of the truth.
         normals: unit vectors.
+
+    Returns:
+        The direction as it was, if surfaces lead farther from it than that: outdoors, trees and banks do.
     """
+    before = up
     for width in np.radians(WIDTHS_DEG).repeat(NUM_STEPS):
         angle = np.arccos(np.clip(np.abs(normals @ up), 0.0, 1.0))
         along, across = (areas * np.exp(-0.5 * (off / width) ** 2) for off in (angle, np.pi / 2 - angle))
@@ -44,4 +48,4 @@ def up_of_surfaces(
         open_as_before = OPEN * (along.sum() + across.sum()) * np.outer(up, up)
         _, vectors = np.linalg.eigh(((across - along)[:, None] * normals).T @ normals - open_as_before)
         up = vectors[:, 0] * np.sign(vectors[:, 0] @ up)
-    return up
+    return up if up @ before >= np.cos(np.radians(WIDTHS_DEG[0])) else before

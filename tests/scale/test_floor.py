@@ -134,6 +134,14 @@ def test_surfaces_of_a_view_face_the_camera_and_have_its_pose():
     assert len(surfaces.points) == (12 - 2 - 2) * 14 and (surfaces.frames == 5).all()
 
 
+def test_surfaces_that_lead_far_from_the_cameras_up_are_not_followed():
+    """A bank of 30° and little else."""
+    bank = np.tile([0.0, np.sin(np.radians(30)), np.cos(np.radians(30))], (50, 1))
+    assert up_of_surfaces(UP, bank, np.ones(50)) == pytest.approx(UP)
+    gentle = np.tile([0.0, np.sin(np.radians(15)), np.cos(np.radians(15))], (50, 1))
+    assert angle(up_of_surfaces(UP, gentle, np.ones(50)), UP) == pytest.approx(15, abs=0.5)
+
+
 def test_a_road_that_a_level_camera_sees_at_a_slant_is_a_floor():
     """As from a car: 20 pixels higher in the image it is 15 to 60 % farther."""
     v, u = np.mgrid[0:376, 0:1241]
