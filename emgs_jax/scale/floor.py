@@ -11,7 +11,7 @@ MIN_SHARE = 0.15  # of the largest level's area: what is lower than the floor is
 MIN_STD = 0.02  # of the logarithm of a height: the floor's own error
 TILT_DEG = 3.0  # standard deviation between up, as it was, and the normal of the floor
 MAX_OFF = 3.0  # standard deviations within which a patch is of the floor
-MAX_BEND = 0.025  # of a patch
+MAX_BEND = 0.025  # of the inverse depth of a patch, from the mean of opposite ones
 NUM_STEPS = 10  # of choosing the patches of the plane anew
 
 
@@ -47,11 +47,11 @@ def surfaces_of(
     sampled = points[::step, ::step].astype(np.float64)
     here, middle = sampled[1:-1, 1:-1], slice(1, -1)
     beside = [(sampled[middle, :-2], sampled[middle, 2:]), (sampled[:-2, middle], sampled[2:, middle])]
-    z, *opposite = (np.stack([part[..., 2] for part in parts]) for parts in ((here,), *beside))
-    is_known = (z[0] > 0) & (np.stack(opposite) > 0).all(axis=(0, 1))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        bends = [np.abs(z[0] * (0.5 / first + 0.5 / second) - 1.0) for first, second in opposite]
-    is_known &= np.max(bends, axis=0) <= MAX_BEND
+    z, is_known = here[..., 2], here[..., 2] > 0
+    for one, other in ((first[..., 2], last[..., 2]) for first, last in beside):
+        with np.errstate(divide="ignore", invalid="ignore"):
+            bend = np.abs(z * (0.5 / one + 0.5 / other) - 1.0)
+        is_known &= (one > 0) & (other > 0) & (bend <= MAX_BEND)
     across, down = (last[is_known] - first[is_known] for first, last in beside)
     crossed, here = np.cross(down, across), here[is_known]
     length = np.linalg.norm(crossed, axis=1)

@@ -27,7 +27,7 @@ class PlanarConfig:
     radius: int = number(1, low=1, high=64)  # of these surroundings, pixels
     min_area: int = number(400, low=1)  # of a region, pixels
     max_spread: float = number(1.2, low=0)  # of a match, in planes of the sweep
-    min_matches: int = number(50, low=3)  # of a region
+    min_matches: int = number(50, low=3)  # of a region, and of each of its planes
     tolerance: float = number(1.0, low=0)  # distance of a supporting match from the plane, in planes of the sweep
     min_share: float = number(0.75, low=0, high=1)  # of a region's matches that must support its planes
     num_draws: int = number(64, low=1, high=1e6)  # of three matches, by RANSAC
@@ -141,8 +141,6 @@ def fill_planes(
     filled, certain = inverse.copy(), np.where(depth > 0, spread, np.inf)
     for region in blank_regions(gray, config):
         near = is_match & region
-        if near.sum() < config.min_matches:
-            continue
         filled_in = _filled(region, near, pixels, inverse, config)
         if filled_in is None:
             continue
