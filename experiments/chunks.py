@@ -1,6 +1,7 @@
 """A long walk in chunks: overlapping runs, started by Hydra's launchers and joined like those of `emgs merge`."""
 
 import copy
+import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,9 +17,10 @@ from tqdm import tqdm
 
 from emgs_jax.config.configure import build, message_of
 from emgs_jax.config.overrides import written
+from emgs_jax.data.base import Dataset
 from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.intrinsics import Pictures, from_numbers
-from emgs_jax.io.files import owned
+from emgs_jax.io.files import owned, write_json
 from emgs_jax.report.page import write_report
 from emgs_jax.runs.files import claim_folder
 from emgs_jax.runs.finished_run import read_run
@@ -26,25 +28,29 @@ from emgs_jax.runs.images import images_of
 from emgs_jax.runs.merging import mergeable, merged, save_merged
 from emgs_jax.runs.results import is_finished
 
-FOLDER = "chunks"  # below the run's, with a folder for each chunk
+FOLDER, WALK = "chunks", "walk.json"  # below the run's, with a folder for each chunk; there: which images they are of
 
 
-def cut(count: int, chunks: int, overlap: int) -> list[range]:
+def cut(count: int, chunks: int, overlap: int, every: int = 1) -> list[range]:
     """Cut frames into chunks of equal length, of which neighbours have `overlap` frames in common.
+
+    Chunks begin at multiples of `every`, so that neighbours have the same keyframes in common.
 
     Raises:
         ValueError: the numbers are no such numbers, or a frame would be in three chunks.
     """
     if not (isinstance(chunks, int) and isinstance(overlap, int) and chunks > 1 and overlap > 0):
         raise ValueError(f"chunks must be 2 or more and overlap 1 or more, whole numbers, got {chunks} and {overlap}")
-    if (count - overlap) // chunks < overlap:
-        most = count // overlap - 1
+    if (count - overlap) // chunks < overlap + every - 1:
+        most = (count - overlap) // (overlap + every - 1)
         raise ValueError(
             f"chunks={chunks} overlap={overlap} would leave each chunk of the {count} frames fewer new ones than it "
             "shares: " + (f"give chunks={most} or fewer" if most > 1 else "give a longer walk")
         )
-    begins = [number * (count - overlap) // chunks for number in range(chunks + 1)]
-    return [range(begin, end + overlap) for begin, end in zip(begins, begins[1:], strict=False)]
+    if overlap <= every:
+        raise ValueError(f"overlap={overlap} has no keyframe of graph.every={every}: give overlap={2 * every} or more")
+    begins = [number * (count - overlap) // chunks // every * every for number in range(chunks)]
+    return [range(begin, end + overlap) for begin, end in zip(begins, [*begins[1:], count - overlap], strict=True)]
 
 
 def run_chunks(
@@ -56,16 +62,19 @@ def run_chunks(
         The metrics of the joined run, and which chunks are missing and why.
     """
     check(config)
-    parts = cut(num_frames(config), config.chunks, config.overlap)
+    walk = walk_of(config)
+    parts = cut(len(walk), config.chunks, config.overlap, config.graph.every)
     words = [words_of(config, part) for part in parts]
     names = [f"chunk {number} ({word[1]} {word[2]})" for number, word in enumerate(words, 1)]
     folders = [folder / FOLDER / str(number) for number in range(1, len(parts) + 1)]
     settings = [settings_of(config, word) for word in words]
 
     def undone() -> list[int]:
-        return [row for row in range(len(parts)) if not is_finished(folders[row], settings[row])]
+        remedy = "choose another hydra.run.dir= or move that folder away"
+        return [row for row in range(len(parts)) if not is_finished(folders[row], settings[row], remedy)]
 
     with owned(folder):
+        check_same(folder / FOLDER / WALK, walk)
         todo = undone()
         tqdm.write(f"{len(parts)} chunks of up to {max(map(len, parts))} frames, {len(todo)} of them to do")
         reasons = launch(folder / FOLDER, [[*words[row], f"hydra.sweep.subdir={row + 1}"] for row in todo], job)
@@ -89,6 +98,15 @@ def run_chunks(
     return metrics, problems
 
 
+def check_same(path: Path, walk: Dataset) -> None:
+    """Note which images the chunks are of; raise ValueError if finished ones are of others."""
+    found = {"fingerprint": walk.fingerprint()}
+    if path.exists() and json.loads(path.read_text(encoding="utf-8")) != found:
+        raise ValueError(f"{path.parent} has chunks of other images: choose another hydra.run.dir= or move it away")
+    path.parent.mkdir(exist_ok=True)
+    write_json(path, found)
+
+
 def check(config: DictConfig) -> None:
     """Raise ValueError for keys with which a walk cannot be cut."""
     if not config.graph:
@@ -98,18 +116,23 @@ def check(config: DictConfig) -> None:
     for key, remedy in (("map", "emgs merge joins that run, too"), ("view", "emgs view"), ("polish", "emgs polish")):
         if config[key]:
             raise ValueError(f"{key}= is of one run, not of chunks=: leave it out ({remedy} afterwards)")
+    if config.get("scale") and config.scale.distance:
+        raise ValueError(
+            "scale.distance= is of an image that one chunk has, and the others would have no unit: leave it out and "
+            "give scale.height=, scale.positions= or scale.imu=, or do without chunks="
+        )
 
 
-def num_frames(config: DictConfig) -> int:
-    """Count the frames that the keys of the data set choose, without estimating intrinsics for it."""
+def walk_of(config: DictConfig) -> Dataset:
+    """Build the data set of the whole walk, without estimating intrinsics for it."""
     if config.dataset.get("intrinsics") != "estimate":
-        return len(build(config, "dataset"))
+        return build(config, "dataset")
 
     def any_camera(pictures: Pictures) -> tuple[Calibration, dict[str, Any]]:
         width, height = pictures.size
         return from_numbers([width, width, width / 2, height / 2]), {}
 
-    return len(build(config, "dataset", intrinsics=any_camera))
+    return build(config, "dataset", intrinsics=any_camera)
 
 
 def words_of(config: DictConfig, part: range) -> list[str]:

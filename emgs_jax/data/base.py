@@ -130,6 +130,14 @@ class Dataset(Protocol):
         """Return a mask (h, w) of image `index` as it is on disk as one of its `full` image."""
         return mask
 
+    def stored_pixels(self, index: int) -> np.ndarray | None:
+        """Return where in its image on disk each pixel of frame `index` is, as shares of width and height (h, w, 2).
+
+        The image's top left corner is (0, 0), its pixels' centres are at (column + 0.5) / width. None where the image
+        is only resized.
+        """
+        return None
+
     def pixel_of(self, index: int, pixel: np.ndarray) -> np.ndarray:
         """Return the column and row, in frame `index`, of a pixel (column, row) of its image on disk."""
         return (np.asarray(pixel, np.float64) + 0.5) * self.size / self.raw_size - 0.5

@@ -70,6 +70,14 @@ class Lens:
         """Undistort depth that is registered to the image, by the nearest, as depths must not be mixed."""
         return depth if self.maps is None else cv2.remap(depth, *self.maps, cv2.INTER_NEAREST)
 
+    def distorted_pixels(self, size: Size) -> Float32[np.ndarray, "h w 2"] | None:
+        """The pixel (column, row) of the distorted image where each of the undistorted one at `size` is."""
+        if self.maps is None:
+            return None
+        return np.stack(
+            [cv2.resize(table, tuple(size), interpolation=cv2.INTER_LINEAR) for table in self.maps], axis=-1
+        )
+
     def straight_pixel(self, pixel: Sequence[float]) -> np.ndarray:
         """The pixel (column, row) of the undistorted image that is nearest to one of the distorted image."""
         if self.maps is None:

@@ -78,6 +78,10 @@ class Straightened(Dataset):
     def straight(self, index: int, mask: Bool[np.ndarray, "h w"]) -> Bool[np.ndarray, "h w"]:
         return self._lens_at(index).straighten_mask(mask)
 
+    def stored_pixels(self, index: int) -> Float32[np.ndarray, "h w 2"] | None:
+        found = self._lens_at(index).distorted_pixels(self.size)
+        return None if found is None else (found + 0.5) / np.float32(self._raw_size)
+
     def pixel_of(self, index: int, pixel: np.ndarray) -> np.ndarray:
         return super().pixel_of(index, self._lens_at(index).straight_pixel(pixel))
 

@@ -18,7 +18,8 @@ from emgs_jax.evaluation.clouds import PointCloud, fuse_clouds
 from emgs_jax.features.text import save_text
 from emgs_jax.io.files import FrameLog, new_folder
 from emgs_jax.io.trajectory import from_tum
-from emgs_jax.loop_closure.place_recognition import Keyframe
+from emgs_jax.keypoints.sift import mutual
+from emgs_jax.loop_closure.place_recognition import Keyframe, unit_descriptors
 from emgs_jax.mapping.atlas import Atlas, set_unjoined_apart, unvisited
 from emgs_jax.mapping.integrate import finish_back_end
 from emgs_jax.mapping.merging import beside, join, motion, with_lost, without_repeats
@@ -35,6 +36,7 @@ from emgs_jax.runs.repeat import repeat
 from emgs_jax.runs.results import METRICS_FILE
 
 OF_DATA = "name", "sequence"  # keys of a provenance's data
+MIN_SAME, MAX_MOVED = 0.5, 0.02  # keypoints that an image has again, and how far off, of its longer side
 
 
 @dataclass(frozen=True)
@@ -178,7 +180,7 @@ def merged(runs: Sequence[MergeableRun], has_truth: bool) -> Merged:
 def shared_frames(parts: Sequence[MergeableRun], other: MergeableRun) -> list[tuple[int, int]]:
     """Pair the frames of runs, counted one run after the other, with those of another run that are the same image.
 
-    Frames are the same if they have one name and time, and those that are keyframes in both have the same keypoints.
+    Frames are the same if they have one name and time, and those that are keyframes in both are of the same image.
     """
     pairs, begin, keyframes = [], 0, keyframes_of(other)
     rows = {(record.name, record.timestamp): row for row, record in enumerate(other.records)}
@@ -199,8 +201,15 @@ def keyframes_of(run: MergeableRun) -> dict[int, Keyframe]:
 
 
 def is_same_image(a: Keyframe, b: Keyframe) -> bool:
-    """Test whether two keyframes are of one image: it has the same keypoints, but for rounding."""
-    return a.size == b.size and a.pixels.shape == b.pixels.shape and np.allclose(a.pixels, b.pixels, atol=0.1)
+    """Test whether two keyframes are of one image: most keypoints of it are there, and where they were.
+
+    Not to the pixel: runs that estimate the intrinsics straighten the image a little differently.
+    """
+    if a.size != b.size:
+        return False
+    rows_a, rows_b = mutual(unit_descriptors(a), unit_descriptors(b), max_ratio=1.0)
+    moved = np.linalg.norm(a.pixels[rows_a] - b.pixels[rows_b], axis=1)
+    return (moved < MAX_MOVED * max(a.size)).sum() >= MIN_SAME * min(len(a.pixels), len(b.pixels))
 
 
 def first_placed(images: Sequence[int], is_placed: Sequence[bool]) -> list[int]:

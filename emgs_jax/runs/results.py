@@ -14,6 +14,10 @@ from emgs_jax.io.files import changes, jsonable
 from emgs_jax.runs.provenance import RESULT_FORMAT, ROWS, prefix_of
 
 METRICS_FILE = "metrics.json"
+ANOTHER_NAME = (
+    "give these settings another name (+variants.NAME={KEY:VALUE} of emgs evaluate, method=NAME of emgs score), choose "
+    "another out=FOLDER or move the folder away"
+)
 _PLACES = ("dataset.root", "compilation_cache")  # places, not what is computed
 
 
@@ -62,16 +66,14 @@ def read_metrics(path: Path, remedy: str = "move its folder away or choose anoth
     return metrics
 
 
-def is_finished(folder: Path, config: Mapping[str, Any]) -> bool:
-    """Test whether the result exists; raise ValueError if it was made with another config."""
+def is_finished(folder: Path, config: Mapping[str, Any], remedy: str = ANOTHER_NAME) -> bool:
+    """Test whether the result exists; raise ValueError, with `remedy`, if it was made with another config."""
     path = folder / METRICS_FILE
     if not path.exists():
         return False
     if changed := changes(read_metrics(path)["provenance"]["config"], jsonable(config), _PLACES):
         raise ValueError(
-            f"{path} was made with other settings ({'; '.join(changed[:3])}{'; …' * (len(changed) > 3)}): "
-            "give these settings another name (+variants.NAME={KEY:VALUE} of emgs evaluate, method=NAME of emgs "
-            "score), choose another out=FOLDER or move the folder away"
+            f"{path} was made with other settings ({'; '.join(changed[:3])}{'; …' * (len(changed) > 3)}): {remedy}"
         )
     return True
 

@@ -9,13 +9,15 @@ from test_kept_points import INTRINSICS, atlas_of, node, posed
 
 from emgs_jax.back_end.factors import Factor, NoiseConfig, chi2, shared_factor
 from emgs_jax.back_end.state import BackEnd
+from emgs_jax.data.camera_models import from_colmap
+from emgs_jax.data.intrinsics import to_lens
 from emgs_jax.data.joined import JoinedFrames
 from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.geometry import Sim3, pose_difference
-from emgs_jax.loop_closure.place_recognition import Database, Keyframe
+from emgs_jax.loop_closure.place_recognition import Database, Keyframe, PlaceRecognitionConfig, make_keyframe
 from emgs_jax.mapping.merging import shared_placement, without_repeats
 from emgs_jax.mapping.records import FrameRecord
-from emgs_jax.runs.merging import first_placed, shared_frames
+from emgs_jax.runs.merging import first_placed, is_same_image, shared_frames
 
 
 def keyframe(row: int, image: int, depth: float = 1.0) -> Keyframe:
@@ -49,6 +51,23 @@ def run(images, folder="", first_node=0):
 )
 def test_runs_have_images_in_common_that_have_the_same_name_time_and_keypoints(parts, other, pairs):
     assert shared_frames(parts, other) == pairs
+
+
+@pytest.mark.parametrize(
+    ("focal", "k1", "row", "expected"), [(282, 0.0, 3, True), (260, -0.1, 3, True), (270, -0.05, 20, False)]
+)
+def test_an_image_is_the_same_where_runs_that_estimate_its_camera_differ(focal, k1, row, expected):
+    """Chunks of a video estimate the intrinsics each for itself."""
+    dataset = Synthetic(num_frames=40, size=[320, 240])
+
+    def found(row, focal, k1):
+        size = (320, 240)
+        lens = to_lens(from_colmap("SIMPLE_RADIAL", [focal, 160.0, 120.0, k1], size, "x"), size, "x", {})
+        points, is_known = np.full((240, 320, 3), 2.0, np.float32), np.ones((240, 320), bool)
+        image = lens.straighten(dataset[row].image)
+        return make_keyframe(0, image, points, is_known, lens.intrinsics, PlaceRecognitionConfig())
+
+    assert is_same_image(found(3, 270.0, -0.05), found(row, float(focal), k1)) == expected
 
 
 def test_the_first_row_of_an_image_that_is_placed_stands_for_all():

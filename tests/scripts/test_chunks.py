@@ -11,20 +11,21 @@ from tiny_run import TINY, compose
 
 from emgs_jax.config import configure
 from emgs_jax.config.configure import build_dataset
+from emgs_jax.data.synthetic import Synthetic
 from emgs_jax.io.files import owned
 from emgs_jax.mapping import tracking, window_input
 from emgs_jax.mapping.window_input import first_pose
 from emgs_jax.runs.finished_run import read_run
 from emgs_jax.runs.images import images_of
 from experiments import chunks
-from experiments.chunks import cut, num_frames, run_chunks, words_of
+from experiments.chunks import check_same, cut, run_chunks, walk_of, words_of
 from experiments.run import run
 
 pytestmark = pytest.mark.xdist_group("tiny")
 
 
 @pytest.mark.parametrize("num", [2, 3, 4, 7, 12])
-@pytest.mark.parametrize("overlap", [1, 2, 5, 20])
+@pytest.mark.parametrize("overlap", [2, 3, 5, 20])
 def test_every_frame_is_in_one_chunk_or_shared_by_two_neighbours(num, overlap):
     least = (num + 1) * overlap
     for count in range(least, least + 60):
@@ -35,6 +36,22 @@ def test_every_frame_is_in_one_chunk_or_shared_by_two_neighbours(num, overlap):
         assert np.ptp([len(part) for part in parts]) <= 1, "the last is no rest"
     with pytest.raises(ValueError, match=f"chunks={num} overlap={overlap} would leave"):
         cut(least - 1, num, overlap)
+
+
+@pytest.mark.parametrize("every", [2, 3, 5])
+def test_neighbours_have_keyframes_in_common_however_far_these_are_apart(every):
+    """Every `every`-th frame of a chunk is one, but not its first."""
+    overlap, num = 2 * every, 3
+    least = overlap + num * (overlap + every - 1)
+    for count in range(least, least + 40):
+        parts = cut(count, num, overlap, every)
+        assert set(np.bincount(np.concatenate(parts), minlength=count)) <= {1, 2}
+        known = [{frame for row, frame in enumerate(part) if row % every == 0 and row} for part in parts]
+        assert all(one & other for one, other in zip(known, known[1:], strict=False))
+    with pytest.raises(ValueError, match="give chunks=2 or fewer"):
+        cut(least - 1, num, overlap, every)
+    with pytest.raises(ValueError, match=f"no keyframe of graph.every={every}: give overlap={2 * every}"):
+        cut(1000, num, every, every)
 
 
 @pytest.mark.parametrize(("num", "overlap"), [(1, 5), (2, 0), (2.5, 5), ("four", 5), (-2, 5)])
@@ -48,7 +65,7 @@ def test_chunks_have_the_frames_that_the_keys_of_the_walk_choose(start, stop, st
     words = [f"dataset.start={start}", f"dataset.stop={stop}", f"dataset.stride={stride}"]
     config = compose(*words, "graph=default")
     whole = [frame.name for frame in build_dataset(config)]
-    assert num_frames(config) == len(whole)
+    assert len(walk_of(config)) == len(whole)
     for part in cut(len(whole), 3, 2):
         own = words_of(config, part)
         assert own[0] == "chunks=null"
@@ -62,11 +79,21 @@ def test_chunks_have_the_frames_that_the_keys_of_the_walk_choose(start, stop, st
         (("graph=default", "map=monday"), "map= is of one run"),
         (("graph=default", "view=live"), "view= is of one run"),
         (("graph=default", "polish=default"), "polish= is of one run"),
+        (("graph=default", "scale.distance=[a.png,1,2,3,4,1.5]"), "scale.distance= is of an image that one chunk has"),
     ],
 )
 def test_keys_of_one_run_are_refused(tmp_path, words, message):
     with pytest.raises(ValueError, match=message):
         run_chunks(compose("chunks=2", *words), tmp_path, None)
+
+
+def test_chunks_of_other_images_are_not_taken_for_those_of_this_walk(tmp_path):
+    walks = [Synthetic(num_frames=6, size=[64, 48], seed=seed) for seed in (0, 1)]
+    path = tmp_path / "chunks" / "walk.json"
+    check_same(path, walks[0])
+    check_same(path, walks[0])
+    with pytest.raises(ValueError, match=r"chunks has chunks of other images: choose another hydra\.run\.dir="):
+        check_same(path, walks[1])
 
 
 def test_a_camera_cannot_be_cut(tmp_path):
@@ -83,9 +110,9 @@ def test_chunks_are_of_the_command_that_joins_them(tmp_path):
 def test_all_chunks_that_are_missing_are_named_if_too_few_are_left(tmp_path, monkeypatch):
     monkeypatch.setattr(chunks, "launch", lambda folder, words, job: ["no disk", ""][: len(words)])
     with pytest.raises(ValueError) as error:
-        run_chunks(compose("chunks=2", "overlap=1", "graph=default"), tmp_path, None)
+        run_chunks(compose("chunks=2", "overlap=2", "graph=default"), tmp_path, None)
     assert str(error.value).splitlines() == [
-        "chunk 1 (dataset.start=0 dataset.stop=3) is missing: no disk",
+        "chunk 1 (dataset.start=0 dataset.stop=4) is missing: no disk",
         "       chunk 2 (dataset.start=2 dataset.stop=6) is missing: it was ended",
         "       so there is nothing to join",
     ]

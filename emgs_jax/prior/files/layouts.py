@@ -210,7 +210,7 @@ def read_colmap_workspace(folder: Path) -> Predictions:
 
     names, files = [Path(model.names[row]).stem for row in rows], [*(paths[row] for row in rows), *model.files]
     poses, source = as_poses(model.T_world_camera[rows], str(model.files[1])), str(model.files[1])
-    return Predictions("COLMAP", names, poses, source, read, files, False, whole_image, may_lack=True)
+    return Predictions("COLMAP", names, poses, source, read, files, False, whole_image, may_lack=True, is_straight=True)
 
 
 def load_colmap_array(path: Path) -> np.ndarray:
@@ -232,7 +232,9 @@ def read_scannet(folder: Path) -> Predictions:
         return as_view(str(paths[row]), read_depth(paths[row], SCANNET_UNITS), None, intrinsics)
 
     names, files = [path.stem for path in paths], [*paths, *places, calibration]
-    return Predictions("ScanNet", names, np.concatenate(poses), f"{folder}/pose", read, files, True, by_rays)
+    return Predictions(
+        "ScanNet", names, np.concatenate(poses), f"{folder}/pose", read, files, True, by_rays, is_straight=True
+    )
 
 
 def read_record3d(folder: Path) -> Predictions:

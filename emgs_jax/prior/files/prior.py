@@ -60,6 +60,7 @@ AUTO = "auto"
 SCALES = ("auto", "metric", "arbitrary")
 TURNS = {3: [[-1, 0], [0, -1]], 6: [[0, 1], [-1, 0]], 8: [[0, -1], [1, 0]]}  # R_stored_shown of an EXIF orientation
 FOCAL_NOTE, FOCAL_ERROR = 1.03, 1.5  # ratio of the files' focal length and the data set's
+STRAIGHTENED = "; images are straightened, and files with them: their depths lie on the rays of dataset.intrinsics"
 NUM_CAMERAS = 16  # views whose intrinsics are looked at for the camera of the images
 TURNED, FITS = np.radians(1.0), 0.01  # poses so wrong cannot have depths that fit so well
 NUM_PAIRS, PAIR_GAP = 5, 5  # of views that are compared, and how many frames apart they are
@@ -102,6 +103,7 @@ class Files(Prior):
         self._pose_std = None if pose_std == AUTO else check_pose_std(pose_std)
         self._is_measured = pose_std == AUTO
         self._rows: list[int | None] = []  # of the frames
+        self._dataset: Dataset | None = None  # that was checked
         self._points: dict[int, DenseView] = {}  # of the last window, by frame
         settings = {"layout": self._found.layout, "scale": "metric" if self._is_metric else "arbitrary"}
         settings |= {} if self._is_metric else {"median_depth": float(median_depth)}
@@ -117,6 +119,7 @@ class Files(Prior):
         self._rows = rows_of(dataset, found.names, self.folder, found.may_lack, remedy)
         known = [index for index, row in enumerate(self._rows) if row is not None]
         camera = Camera((dataset.size[0], dataset.size[1]), dataset.intrinsics)
+        self._dataset = dataset
         view, depth = self._first_depth()
         if self._is_metric:
             remedies = "write metres, give prior.depth_scale (units of a metre in .png files; 1000: mm), or"
@@ -133,7 +136,8 @@ class Files(Prior):
         unread = f"; not read: {', '.join(found.unread)}" if found.unread else ""
         lacking = f", {len(self._rows) - len(known)} frames have none" if len(known) < len(self._rows) else ""
         try:
-            note = _focal_note(view, camera, found) + _turned_note(turned)
+            note = _focal_note(view, camera, found) if dataset.stored_pixels(0) is None else STRAIGHTENED
+            note += _turned_note(turned)
         except ValueError as error:
             raise ValueError(f"{error}{_turned_note(turned)}") from error
         pairs = self._pairs(known, camera)
@@ -182,8 +186,10 @@ class Files(Prior):
         row = self._rows[index]
         if row is None or not np.isfinite(self._found.poses[row]).all():
             return no_points(camera.size)
-        view = self._found.read(row)
-        points, confidence, mask = at_frame(view, camera, self._found.place, self._max_depth_step)
+        stored, place = None if self._dataset is None else self._dataset.stored_pixels(index), self._found.place
+        if stored is not None and self._found.is_straight:  # by another program, which has cropped them otherwise
+            stored, place = None, by_rays
+        points, confidence, mask = at_frame(self._found.read(row), camera, place, self._max_depth_step, stored)
         return points * np.float32(self._factor), confidence, mask
 
     def _first_depth(self) -> tuple[View, float]:

@@ -50,6 +50,7 @@ class Stream(Prior):
         self._pose_std = check_pose_std(pose_std)
         self._poses: dict[int, np.ndarray] = {}  # of the last window, by frame
         self._points: dict[int, DenseView] = {}  # likewise
+        self._dataset: Dataset | None = None  # that was checked
         self._first: list[Sight] | None = []  # views with a pose, until they are compared
         settings = {"scale": "metric", "max_depth_step": self._max_depth_step}
         self.provenance = Provenance("stream", settings | {"pose_std": self._pose_std and [*self._pose_std]})
@@ -69,6 +70,7 @@ class Stream(Prior):
                 f"prior=stream needs images with a depth and a pose, and {dataset.name} has none of its own"
             )
         own_pose(_beside(files[0]))
+        self._dataset = dataset
 
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         size = frames[0].image.shape[1::-1]
@@ -78,7 +80,7 @@ class Stream(Prior):
         poses = np.concatenate([*self._poses.values()])
         for index in window.dense:
             is_known = bool(np.isfinite(poses[window.views.index(index)]).all())
-            self._points[index] = before.get(index) or self._at_frame(_beside(names[index]), camera, is_known)
+            self._points[index] = before.get(index) or self._at_frame(index, _beside(names[index]), camera, is_known)
         if self._first is not None:
             self._check_conventions(window, poses[window.views.index(window.current)], camera)
         T_anchor_view = relative_poses(poses) if np.isfinite(poses[0]).all() else poses
@@ -88,11 +90,12 @@ class Stream(Prior):
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> None:
         """Nothing: odometry that has drifted does not measure a loop."""
 
-    def _at_frame(self, path: Path, camera: Camera, is_known: bool) -> DenseView:
+    def _at_frame(self, index: int, path: Path, camera: Camera, is_known: bool) -> DenseView:
         """Points, confidence and mask of a frame; none is valid without a pose."""
         if not is_known:
             return no_points(camera.size)
-        return at_frame(read_npz_view(path), camera, whole_image, self._max_depth_step)
+        stored = None if self._dataset is None else self._dataset.stored_pixels(index)
+        return at_frame(read_npz_view(path), camera, whole_image, self._max_depth_step, stored)
 
     def _check_conventions(self, window: Window, pose: np.ndarray, camera: Camera) -> None:
         """Compare the first views with a pose that has moved from one to the next, once there are enough.

@@ -70,6 +70,7 @@ class Predictions:
     is_metric: bool
     place: Place  # the part of the image that grids show
     may_lack: bool = False  # frames without a view are allowed
+    is_straight: bool = False  # they are of undistorted images, with their own calibration, not of those on disk
     unread: tuple[str, ...] = ()  # arrays of the first file that are not used
 
 
@@ -100,9 +101,13 @@ def by_rays(camera: Camera, view: View) -> Part:
 
 
 def at_frame(
-    view: View, camera: Camera, place: Place, max_depth_step: float
+    view: View, camera: Camera, place: Place, max_depth_step: float, stored: Float[np.ndarray, "h w 2"] | None = None
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
-    """Resample a view at the frame's pixels, see `resize.at_pixels`; points lie where its own calibration has them."""
+    """Resample a view at the frame's pixels, see `resize.at_pixels`; points lie where its own calibration has them.
+
+    Frames without the distortion of their images, of which the view is, have `stored` (`Dataset.stored_pixels`). There
+    depths lie on the frame's rays: no calibration of a pinhole says where the distorted image has them.
+    """
     scaled, corner = place(camera, view)
     mask = usable(view.geometry)
     confidence = np.ones(mask.shape) if view.confidence is None else view.confidence
@@ -110,7 +115,13 @@ def at_frame(
     intrinsics = view.intrinsics or grid_intrinsics(camera, Part(scaled, corner))
     points = backproject(geometry, intrinsics) if geometry.ndim == 2 else geometry
     on_grid = points.astype(np.float32), np.where(mask, confidence, 1).astype(np.float32), mask
-    return at_pixels(*on_grid, on_grid_of(camera.size, scaled, corner), max_depth_step)
+    if stored is None:
+        return at_pixels(*on_grid, on_grid_of(camera.size, scaled, corner), max_depth_step)
+    columns, rows = np.moveaxis(stored * scaled - 0.5 - np.asarray(corner), -1, 0)
+    points, confidence, mask = at_pixels(*on_grid, (columns, rows), max_depth_step)
+    if geometry.ndim == 2:
+        points = backproject(points[..., 2], camera.intrinsics).astype(np.float32)
+    return points, confidence, mask
 
 
 def usable(geometry: Float[np.ndarray, "gh gw *c"]) -> Bool[np.ndarray, "gh gw"]:

@@ -134,7 +134,11 @@ def _reader(dataset: Dataset, found: DepthFiles, folder: Path) -> Callable[[int]
         values = found.read(rows[frame])
         whole_image(camera, View(f"{found.files[min(rows[frame], len(found.files) - 1)]}", values))
         # Where the file has a value for every pixel, no values are mixed across a depth edge.
-        way = cv2.INTER_LINEAR if values.shape[1] < size[0] else cv2.INTER_NEAREST_EXACT
-        return cv2.resize(values, size, interpolation=way)
+        is_coarse, stored = values.shape[1] < size[0], dataset.stored_pixels(frame)
+        if stored is None:
+            return cv2.resize(values, size, interpolation=cv2.INTER_LINEAR if is_coarse else cv2.INTER_NEAREST_EXACT)
+        x, y = np.moveaxis(stored * np.float32(values.shape[1::-1]) - np.float32(0.5), -1, 0)
+        way = cv2.INTER_LINEAR if is_coarse else cv2.INTER_NEAREST
+        return cv2.remap(values, x, y, way, borderMode=cv2.BORDER_REPLICATE)
 
     return read

@@ -76,20 +76,22 @@ def at_pixels(
     points: Float32[np.ndarray, "gh gw 3"],
     confidence: Float32[np.ndarray, "gh gw"],
     mask: Bool[np.ndarray, "gh gw"],
-    pixels: tuple[Float[np.ndarray, " w"], Float[np.ndarray, " h"]],
+    pixels: tuple[Float[np.ndarray, "..."], Float[np.ndarray, "..."]],
     max_depth_step: float,
 ) -> tuple[Float32[np.ndarray, "h w 3"], Float32[np.ndarray, "h w"], Bool[np.ndarray, "h w"]]:
     """Resample points (camera frame), confidence and mask of a grid at the grid columns and rows `pixels`.
+
+    These are of the frame's columns (w,) and rows (h,), or each of its pixels (h, w).
 
     Mask and confidence are those of the nearest grid pixel; beyond the grid the mask is off. The point is interpolated
     (ray and inverse depth, which are linear on a plane) where the four pixels around are valid and differ in depth by
     at most `max_depth_step`, else it is the nearest. Where the mask is off, the point is 0 and the confidence 1.
     """
-    columns, rows = pixels
+    columns, rows = pixels[0], pixels[1] if pixels[1].ndim == 2 else pixels[1][:, None]
     height, width = mask.shape
     column, row = np.floor(columns + 0.5).astype(int), np.floor(rows + 0.5).astype(int)
-    is_inside = ((row >= 0) & (row < height))[:, None] & ((column >= 0) & (column < width))
-    nearest = np.ix_(row.clip(0, height - 1), column.clip(0, width - 1))
+    is_inside = (row >= 0) & (row < height) & (column >= 0) & (column < width)
+    nearest = row.clip(0, height - 1), column.clip(0, width - 1)
     on = is_inside & mask[nearest]
     chosen = points[nearest]
     if (columns % 1).any() or (rows % 1).any():  # at whole pixels nothing lies between
@@ -108,12 +110,12 @@ def _interpolate(
     """Points (h, w, 3) between the grid's pixels, and where they are defined (h, w), which whole pixels are not."""
     height, width = mask.shape
     left, top = np.floor(columns).astype(int).clip(0, width - 2), np.floor(rows).astype(int).clip(0, height - 2)
-    x, y = (columns - left)[None, :], (rows - top)[:, None]
+    x, y = columns - left, rows - top
     depth = np.where(mask, points[..., 2], 1)
     coordinates = np.stack([points[..., 0] / depth, points[..., 1] / depth, 1 / depth], axis=-1)
     mixed, low, high, is_whole = 0.0, np.inf, -np.inf, True
     for down, right, weight in ((0, 0, (1 - y) * (1 - x)), (0, 1, (1 - y) * x), (1, 0, y * (1 - x)), (1, 1, y * x)):
-        corner = np.ix_(top + down, left + right)
+        corner = top + down, left + right
         mixed = mixed + weight[..., None] * coordinates[corner]
         low, high = np.minimum(low, depth[corner]), np.maximum(high, depth[corner])
         is_whole = is_whole & mask[corner]
