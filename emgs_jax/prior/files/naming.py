@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from emgs_jax.data.base import Dataset
-from emgs_jax.data.file_names import check_numbering
+from emgs_jax.data.file_names import check_numbering, frame_name
 
 
 def rows_of(
@@ -13,6 +13,7 @@ def rows_of(
 ) -> list[int | None]:
     """Row of every frame among the predictions' `names`: by image name, apart from a common ending, else by order.
 
+    Where a video has more predictions than frames in use, their names are the numbers of its frames, from 0 on.
     With `may_lack` a frame without a prediction gets None; else ValueError, with `remedy`.
     """
     files = [dataset.files(index)[:1] for index in range(len(dataset))]
@@ -26,6 +27,10 @@ def rows_of(
     best = [""] if "" in best else best  # names as they are say most
     if not has_names or not counts[best[0]]:
         if len(names) != len(stems):
+            numbered = {name.zfill(6): row for name, row in rows.items()}
+            own = [*map(frame_name, map(getattr(dataset, "number", int), range(len(stems))))]
+            if not has_names and {frame_name(0), *own} <= numbered.keys():
+                return [numbered[name] for name in own]
             raise ValueError(
                 f"{folder} has {len(names)} predictions ({names[0]} ...) and the data set {len(stems)} frames "
                 f"({stems[0] or 'without names'} ...), and their names do not tell which is whose: name the files as "

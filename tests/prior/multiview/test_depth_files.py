@@ -103,6 +103,24 @@ def test_files_without_the_frames_names_are_in_the_order_of_their_numbers(tmp_pa
         rows_of(Frames([None] * 5), found.names, tmp_path)
 
 
+@pytest.mark.parametrize("name", ["{:06d}", "{:04d}", None])
+def test_depths_of_every_frame_of_a_video_are_found_by_the_numbers_of_those_in_use(tmp_path, name):
+    every = np.float32(np.random.default_rng(1).uniform(0.1, 1.0, (30, 6, 8)))
+    for number, values in enumerate(every if name else []):
+        np.save(tmp_path / f"{name.format(number)}.npy", values)
+    if name is None:  # one file has all
+        np.savez(tmp_path / "video_depths.npz", depths=every)
+    found = open_depths(tmp_path, "affine_inverse", 1000.0)
+    video = Frames([None] * 4)
+    video.number = lambda index: 5 + 7 * index
+    np.testing.assert_array_equal([found.read(row) for row in rows_of(video, found.names, tmp_path)], every[5:27:7])
+    if name:
+        for number in range(30, 0, -1):  # ffmpeg counts from 1
+            (tmp_path / f"{name.format(number - 1)}.npy").rename(tmp_path / f"{name.format(number)}.npy")
+        with pytest.raises(ValueError, match="and their names do not tell which is whose"):
+            rows_of(video, open_depths(tmp_path, "affine_inverse", 1000.0).names, tmp_path)
+
+
 def test_more_files_than_frames_are_no_error_by_name_and_a_frame_without_a_file_is(tmp_path):
     each(tmp_path, save, "_depth.npy")
     found = open_depths(tmp_path, "affine_inverse", 1000.0)
