@@ -82,9 +82,9 @@ def run_chunks(
         problems = [f"{names[row]} is missing: {reasons[row] or 'it was ended'}" for row in left]
         if len(parts) - len(left) < 2:
             raise ValueError("\n       ".join([*problems, "so there is nothing to join"]))
-        read = [mergeable(folders[row]) for row in range(len(parts)) if row not in left]
-        tqdm.write(f"joining {len(read)} chunks …")
+        tqdm.write(f"joining {len(parts) - len(left)} chunks …")
         try:
+            read = [mergeable(folders[row]) for row in range(len(parts)) if row not in left]
             joined = merged(read, has_truth=True)
         except ValueError as error:
             raise ValueError("\n       ".join([*problems, str(error)])) from error

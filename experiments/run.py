@@ -50,7 +50,8 @@ from emgs_jax.runs.metrics import (
     spent,
 )
 from emgs_jax.runs.polished import OPTAX, polish
-from emgs_jax.runs.provenance import described, is_metric, provenance, signature, write_metrics
+from emgs_jax.runs.provenance import described, is_in_metres, is_metric, provenance, signature, write_metrics
+from emgs_jax.runs.results import METRICS_FILE, read_metrics
 from emgs_jax.runs.snapshot import save_snapshot
 from emgs_jax.viewer.live import LiveView, live_view
 from emgs_jax.viewer.ros import NewMapError, RosConfig, RosView, ros_view
@@ -94,9 +95,10 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
                     tqdm.write("compiling before the first image is taken …")
                     prepared()
             prior.keep(folder)
-            slam, densify = slam.in_unit(prior.metre), densify.in_unit(prior.metre)
-            if prior.metre != 1:
-                tqdm.write(f"lengths of slam= and densify= count {prior.metre:.3g} times, for the unit of the prior")
+            metre, of_saved = unit_of_map(config.map, prior)
+            slam, densify = slam.in_unit(metre), densify.in_unit(metre)
+            if metre != 1:
+                tqdm.write(f"lengths of slam= and densify= count {metre:.3g} times, for the unit of the map")
             saved = load_saved_map(config.map, config.map_mode, graph, dataset.intrinsics, float(slam.fit.min_std))
             session = new_run(dataset, slam, clock, graph=graph, saved=saved)
             watched = build(config, "view") if config.view else None
@@ -106,8 +108,7 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
             baselines = Baselines(fused, slam.observation, dataset)
             settings = OmegaConf.to_container(config, resolve=True)
             origin = provenance(settings, dataset, prior.provenance)
-            if prior.metre != 1:
-                origin["metre"] = prior.metre
+            origin |= of_saved | ({"metre": metre} if metre != 1 else {})
             if saved is not None:
                 origin["map"] = saved.checksum
             if isinstance(watched, RosConfig):
@@ -130,7 +131,8 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
         if is_live:  # all its frames are known now
             origin["data"] = described(dataset)
         origin["config"] |= {"dataset": dataset.recording() or settings["dataset"]}
-        metrics, notes = _write(session, raw, dataset, prior, baselines, (evaluation, densify), folder)
+        unit = "m" if is_in_metres(origin) else "units"
+        metrics, notes = _write(session, raw, dataset, prior, baselines, (evaluation, densify), folder, unit)
         metrics |= describe(session, dataset) | score_back_end(session) | spent(clock) | prior.report()
         metrics |= dataset.report()
         metrics |= scale_off(metrics)
@@ -154,6 +156,20 @@ def run(config: DictConfig, folder: Path) -> dict[str, Any]:
     for note in [*counts, *notes, took]:
         tqdm.write(note)
     return metrics
+
+
+def unit_of_map(map: str | None, prior: Prior) -> tuple[float, dict[str, bool]]:
+    """What a metre is in the map, and for its provenance whether it is in metres: a saved map keeps its unit."""
+    path = None if map is None else Path(map) / METRICS_FILE
+    if path is None or not path.is_file():  # which `load_saved_map` says
+        return prior.metre, {}
+    block = read_metrics(path, f"give another map= than {map}")["provenance"]
+    found = is_in_metres(block)
+    if not found and is_metric(prior.provenance.settings):
+        tqdm.write(
+            f"map={map} has a unit of its own and keeps it: no length is in metres, whatever the prior or scale= says"
+        )
+    return block.get("metre", 1.0), {"is_metric": found}
 
 
 @contextlib.contextmanager
@@ -224,6 +240,7 @@ def _write(
     baselines: Baselines,
     configs: tuple[EvaluationConfig, DensifyConfig],
     folder: Path,
+    unit: str,
 ) -> tuple[dict[str, Any], list[str]]:
     """Draw the map, write it and compare it with the truth; the raw prior is scored meanwhile.
 
@@ -241,7 +258,6 @@ def _write(
             dense = dense_map(run, dataset, densify, evaluation, labelled, own=raw.points)
         with _said(clock, "export", "writing the map, its points, a mesh and the overview"):
             title = f"{dataset.name} {dataset.sequence}, prior {prior.provenance.name}"
-            unit = "m" if is_metric(prior.provenance.settings) else "units"
             notes = save_outputs(folder, run, dense, densify, title, evaluation.alignment == "sim3", unit)
             save_classes(folder, prior)
         compared = ", ".join(["the map", "the raw prior", *baselines.raw]) if dataset.has_ground_truth else ""

@@ -18,7 +18,7 @@ from emgs_jax.io.trajectory import from_tum, load_trajectory_tum
 from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.camera import Camera
 from emgs_jax.render.composite import RenderConfig
-from emgs_jax.runs.provenance import is_metric
+from emgs_jax.runs.provenance import is_in_metres
 from emgs_jax.runs.results import METRICS_FILE, read_metrics, sound
 
 TEXT_FILE = "text.npz"  # classes of a map with features, in the format of `experiments.embed`
@@ -79,7 +79,7 @@ class FinishedRun:
     @property
     def is_metric(self) -> bool:
         """Whether lengths of the map are meant to be metres."""
-        return is_metric(self.provenance["prior"]["settings"])
+        return is_in_metres(self.provenance)
 
 
 def read_run(folder: Path) -> FinishedRun:

@@ -115,6 +115,11 @@ def is_metric(settings: Mapping[str, Any]) -> bool:
     return has_unit and all(value != "arbitrary" for key, value in said.items() if key.endswith("scale"))
 
 
+def is_in_metres(block: Mapping[str, Any]) -> bool:
+    """Test whether the map of a run is in metres: a saved one that was continued keeps its unit."""
+    return block.get("is_metric", is_metric(block["prior"]["settings"]))
+
+
 def has_metric_truth(block: Mapping[str, Any]) -> bool:
     """Test whether the true poses of a result are in metres."""
     return (block.get("data") or {}).get("name") not in OWN_UNITS

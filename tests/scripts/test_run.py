@@ -5,6 +5,7 @@ import re
 import sys
 from collections import Counter
 from pathlib import Path
+from types import SimpleNamespace
 
 import hydra
 import numpy as np
@@ -19,6 +20,7 @@ from emgs_jax.gaussian_map import confirmed
 from emgs_jax.io.map_file import load_map
 from emgs_jax.io.ply_reader import read_vertices
 from emgs_jax.io.trajectory import load_trajectory_tum
+from emgs_jax.runs.provenance import RESULT_FORMAT, is_in_metres
 from experiments.command import clear_errors
 
 pytestmark = pytest.mark.xdist_group("tiny")
@@ -220,3 +222,19 @@ def test_an_error_of_a_constructor_is_one_clear_line(monkeypatch):
     monkeypatch.setenv("HYDRA_FULL_ERROR", "1")
     with pytest.raises(hydra.errors.InstantiationException), clear_errors():
         hydra.utils.instantiate(prior)
+
+
+@pytest.mark.parametrize(
+    ("unit", "continued", "expected"), [("m", None, True), (None, None, False), ("m", False, False)]
+)
+def test_a_map_that_is_continued_keeps_its_unit(tmp_path, capsys, unit, continued, expected):
+    """Whatever the prior says: an own unit of yesterday was called metres where scale= was given today."""
+    metric, own = {"scale": "metric"}, {"scale": "arbitrary", "median_depth": 2.0}
+    block = {"format": RESULT_FORMAT, "prior": {"settings": metric if unit else own}, "metre": 0.4}
+    block |= {} if continued is None else {"is_metric": continued}
+    (tmp_path / "metrics.json").write_text(json.dumps({"provenance": block}))
+    today = SimpleNamespace(metre=3.0, provenance=SimpleNamespace(settings=metric))
+    assert experiments.run.unit_of_map(str(tmp_path), today) == (0.4, {"is_metric": expected})
+    assert ("has a unit of its own and keeps it" in capsys.readouterr().out) == (not expected)
+    assert is_in_metres({**block, "prior": {"settings": metric}, "is_metric": expected}) == expected
+    assert experiments.run.unit_of_map(None, today) == (3.0, {})
