@@ -8,7 +8,7 @@ import json
 import os
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ from emgs_jax.data.intrinsics import Given, Pictures, find_lens, to_lens
 from emgs_jax.data.reading import Size, about_pixels
 from emgs_jax.data.straightened import Straightened
 from emgs_jax.io.files import atomic_write, write_file
-from emgs_jax.live.capture import is_ros, start
+from emgs_jax.live.capture import is_ros, name_of, start
 from emgs_jax.live.newest import Newest, Shot
 
 RECORDED = "recorded"  # folder of a run
@@ -46,7 +46,7 @@ class Camera(Straightened):
     `len` counts the frames that were taken; `has` waits for the next one. Nothing is known of the truth.
     """
 
-    source: str | int = 0  # 0, 1, /dev/video0, rtsp://…, a video, or a recorded folder
+    source: str | int | Iterator[Shot] = 0  # 0, 1, /dev/video0, rtsp://…, a video, a recorded folder, or your images
     intrinsics: Given | None = None  # see `intrinsics.find_lens`; to estimate them, all images are taken first
     size: Sequence[int] | None = None  # (width, height) of the frames; None: about 320 x 240 pixels
     fps: float | None = None  # most images a second; None: as many as are asked for
@@ -61,11 +61,13 @@ class Camera(Straightened):
         self._newest, self._is_over, self._is_live = Newest(), False, False
         self._images, self._times, self._arrived, self._mapped = [], [], [], []
         self._rates: Rates | None = None
-        self.sequence, self._given = str(self.source), self.intrinsics  # `_use` replaces the latter
+        source = self.source if isinstance(self.source, Iterator) else str(self.source)
+        self.source = self.sequence = name_of(source)
+        self._given = self.intrinsics  # `_use` replaces it
         if self._given == "exif" or (self._given is None and not is_ros(self.sequence)):
             raise ValueError(NO_INTRINSICS)
         self._folder = self._new_folder()
-        told = start(self.sequence, self._newest, needs_camera=self._given is None)
+        told = start(source, self._newest, needs_camera=self._given is None)
         shot = self._newest.take(FIRST_S)
         if shot is None:
             raise ValueError(self._newest.reason or self._said(f"gives no image in {FIRST_S:g} s"))

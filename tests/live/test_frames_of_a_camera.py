@@ -4,6 +4,7 @@ import os
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from queue import Queue
 
 import cv2
 import numpy as np
@@ -278,6 +279,29 @@ def test_a_camera_of_the_network_that_stalls_gives_no_more_frames(monkeypatch):
             server.shutdown()
     assert "has given none for 1 s" in frames._newest.reason
     assert np.diff([frames[row].image.mean() for row in range(len(frames))]).min() > 0, "in order, none twice"
+
+
+def test_an_iterator_of_python_is_a_source():
+    """As docs/live.md says; whatever fails in it ends the frames with its reason."""
+    images = Queue()
+    frames = Camera(source=iter(fed(images, Shot(5.0, an_image(5))).get, None), intrinsics=INTRINSICS, size=(32, 24))
+    fed(images, Shot(6.0, an_image(6), {"T_world_camera": np.eye(4)}))
+    assert frames.has(1) and [frames[row].timestamp for row in (0, 1)] == [5.0, 6.0]
+    np.testing.assert_array_equal(np.load(path_beside(frames, 1))["T_world_camera"], np.eye(4))
+    fed(images, None)
+    assert not frames.has(2) and frames._newest.reason == "camera iterator has ended"
+
+    def broken():
+        yield Shot(0.0, an_image(0))
+        raise KeyError("depth")
+
+    frames = Camera(source=broken(), intrinsics=INTRINSICS)
+    assert not frames.has(1) and frames._newest.reason == "camera iterator has failed: 'depth'"
+
+
+def fed(images: Queue, image: Shot | None) -> Queue:
+    images.put(image)
+    return images
 
 
 @pytest.mark.parametrize("given", [None, "exif"])
