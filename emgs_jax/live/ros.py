@@ -123,8 +123,8 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
         say()
 
     def add_moving(message: Any) -> None:
-        for time_s in frames.transforms.add_moving(message, frames.camera, odom_frame):
-            put(joined.add("pose", time_s, None), joined.num_alone)
+        if frames.transforms.add_moving(message, frames.camera, odom_frame):
+            put(joined.whole(), joined.num_alone)
         say()
 
     image_type = CompressedImage if topics.get("image", "").endswith("compressed") else Image

@@ -36,12 +36,12 @@ class Transforms:
         for child, parent, _, T_parent_child in self._read(message):
             self._fixed[child] = parent, T_parent_child
 
-    def add_moving(self, message: Any, below: str, above: str) -> list[float]:
-        """Take the transforms of a TFMessage on /tf; return the times of those on the way from a frame up to another.
+    def add_moving(self, message: Any, below: str, above: str) -> bool:
+        """Take the transforms of a TFMessage on /tf; return whether one is on the way from a frame up to another.
 
         A time that lies far before the last one begins anew, as a bag that is played again.
         """
-        times = []
+        is_on_way = False
         for child, parent, time_s, T_parent_child in self._read(message):
             known, poses = self._moving.get(child, (parent, []))
             if known != parent or (poses and time_s < poses[-1][0] - BACK_S):
@@ -50,9 +50,8 @@ class Transforms:
             while poses[-1][0] - poses[0][0] > KEPT_S:
                 del poses[0]
             self._moving[child] = parent, poses
-            if child in self.way(below, above):
-                times.append(time_s)
-        return times
+            is_on_way |= child in self.way(below, above)
+        return is_on_way
 
     def pose(self, below: str, above: str, time_s: float) -> np.ndarray | None:
         """Return T_above_below (4, 4) at a time; None if `above` is not above it, or that is not known for the time."""
