@@ -52,7 +52,7 @@ def read_classes(path: str | os.PathLike) -> ClassFile:
     """Read a class file; ValueError if it cannot be read or is none."""
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8")
+        text = path.read_text(encoding="utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         reason = "does not exist" if isinstance(error, FileNotFoundError) else f"cannot be read ({error})"
         raise ValueError(f"class file {path} {reason}: {REMEDY}") from error

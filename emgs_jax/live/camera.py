@@ -4,10 +4,11 @@ Each image that is taken becomes a file, with what came beside it (depth, pose) 
 memory is bounded, and the same command on the folder maps the same frames again (`prior=stream`).
 """
 
+import json
 import os
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -22,11 +23,12 @@ from emgs_jax.data.images import Images
 from emgs_jax.data.intrinsics import Given, Pictures, find_lens, to_lens
 from emgs_jax.data.reading import Size, about_pixels
 from emgs_jax.data.straightened import Straightened
-from emgs_jax.io.files import atomic_write
-from emgs_jax.live.capture import is_ros, start
+from emgs_jax.io.files import atomic_write, write_file
+from emgs_jax.live.capture import is_ros, name_of, start
 from emgs_jax.live.newest import Newest, Shot
 
 RECORDED = "recorded"  # folder of a run
+CAMERA_FILE = "camera.json"  # the intrinsics of the images there, for dataset.intrinsics; not where they are estimated
 FIRST_S, NEXT_S = 30.0, 10.0  # longest wait for the first image, and for each other one
 NUM_TIMED = 20  # frames of which the bar tells the rate
 FAST = [cv2.IMWRITE_PNG_COMPRESSION, 1]
@@ -44,7 +46,7 @@ class Camera(Straightened):
     `len` counts the frames that were taken; `has` waits for the next one. Nothing is known of the truth.
     """
 
-    source: str | int = 0  # 0, 1, /dev/video0, rtsp://…, a video, or a recorded folder
+    source: str | int | Iterator[Shot] = 0  # 0, 1, /dev/video0, rtsp://…, a video, a recorded folder, or your images
     intrinsics: Given | None = None  # see `intrinsics.find_lens`; to estimate them, all images are taken first
     size: Sequence[int] | None = None  # (width, height) of the frames; None: about 320 x 240 pixels
     fps: float | None = None  # most images a second; None: as many as are asked for
@@ -59,11 +61,13 @@ class Camera(Straightened):
         self._newest, self._is_over, self._is_live = Newest(), False, False
         self._images, self._times, self._arrived, self._mapped = [], [], [], []
         self._rates: Rates | None = None
-        self.sequence, self._given = str(self.source), self.intrinsics  # `_use` replaces the latter
+        source = self.source if isinstance(self.source, Iterator) else str(self.source)
+        self.source = self.sequence = name_of(source)
+        self._given = self.intrinsics  # `_use` replaces it
         if self._given == "exif" or (self._given is None and not is_ros(self.sequence)):
             raise ValueError(NO_INTRINSICS)
         self._folder = self._new_folder()
-        told = start(self.sequence, self._newest, needs_camera=self._given is None)
+        told = start(source, self._newest, needs_camera=self._given is None)
         shot = self._newest.take(FIRST_S)
         if shot is None:
             raise ValueError(self._newest.reason or self._said(f"gives no image in {FIRST_S:g} s"))
@@ -86,6 +90,10 @@ class Camera(Straightened):
         self._use(lens, self._raw_size, f"{as_words(self._raw_size)}, {name}")
         if not self._images:
             self._add(shot)
+            if self.record:
+                keys = "width", "height", "fx", "fy", "cx", "cy"
+                camera = dict(zip(keys, (*self._raw_size, *lens.intrinsics), strict=True))
+                write_file(self._folder / CAMERA_FILE, json.dumps(camera))
 
     def _said(self, words: str) -> str:
         """What the camera does, with the last problem of its images."""
@@ -115,14 +123,7 @@ class Camera(Straightened):
             time_s = round(self._times[-1] + 1e-6, 6)
         path, image, given = self._folder / f"{time_s:.6f}.png", shot.image, dict(shot.given or {})
         if self._bent is not None and self._bent.maps is not None:
-            image = self._bent.straighten(image)
-            for name in {"depth", "confidence"} & given.keys():
-                if given[name].shape != image.shape[:2]:
-                    raise ValueError(
-                        f"the {name} of camera {self.source} has not the size of its images, whose lens has "
-                        "distortion: take rectified images"
-                    )
-                given[name] = self._bent.straighten_depth(given[name])  # registered to the image
+            image, given = self._bent.straighten(image), self._straight_given(given, image.shape[:2])
         elif self._bent is None and "depth" in given:
             raise ValueError("with a depth for each image dataset.intrinsics=[fx,fy,cx,cy] are needed, not estimate")
         if given:
@@ -134,6 +135,24 @@ class Camera(Straightened):
         self._last = path, image
         self._times.append(float(path.stem))
         self._arrived.append(shot.arrived)
+
+    def _straight_given(self, given: dict[str, np.ndarray], shape: tuple[int, ...]) -> dict[str, np.ndarray]:
+        """What came with an image of a lens with distortion, registered to it, without the distortion."""
+        given, remedy = dict(given), "register the depth to the images, or take rectified images"
+        for name in {"depth", "confidence"} & given.keys():
+            if given[name].shape != shape:
+                raise ValueError(
+                    f"the {name} of camera {self.source} has not the size of its images, whose lens has distortion: "
+                    f"{remedy}"
+                )
+            given[name] = self._bent.straighten_depth(given[name])
+        own, known = given.pop("intrinsics", None), self._bent.about["intrinsics"]  # others hold from here on
+        if own is not None and not is_camera(own, known):
+            raise ValueError(
+                f"the intrinsics beside an image of camera {self.source}, {own.tolist()}, are not those of the images, "
+                f"{known}, whose lens has distortion: {remedy}"
+            )
+        return given
 
     def _read(self, index: int) -> UInt8[np.ndarray, "_ _ 3"]:
         """The image on disk; the last one that was written is still here."""
@@ -244,6 +263,14 @@ class Camera(Straightened):
     def fingerprint(self) -> str:
         """Hex digest of the frames so far, as of a folder of images."""
         return Images(str(self._folder), size=self.size, intrinsics=self._given).fingerprint()
+
+
+def is_camera(given: np.ndarray, known: Sequence[float]) -> bool:
+    """Test whether intrinsics, (4,) or a camera matrix, are fx, fy, cx, cy that are known, up to half a pixel."""
+    fx, fy, cx, cy = known
+    same = np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]] if given.ndim == 2 else known)
+    values = given[:3, :3] if given.ndim == 2 else given
+    return values.shape == same.shape and bool(np.allclose(values, same, rtol=0, atol=0.5))
 
 
 def as_words(size: Size) -> str:

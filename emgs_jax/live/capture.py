@@ -7,7 +7,7 @@ import itertools
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
 from functools import partial
 from pathlib import Path
 
@@ -28,18 +28,23 @@ ERRORS = OSError, ValueError, cv2.error  # of reading an image
 GIVEN = ("depth", "T_world_camera", "intrinsics", "confidence")  # arrays beside an image, as in files of prior=files
 
 
-def start(source: str, into: Newest, needs_camera: bool = False) -> Calibration | None:
+def start(source: str | Iterator[Shot], into: Newest, needs_camera: bool = False) -> Calibration | None:
     """Open a source and offer its images to `into`, from a thread; ValueError if it cannot be opened.
 
     Returns the camera if that is needed and the source tells it.
     """
-    if is_ros(source):
+    if isinstance(source, str) and is_ros(source):
         from emgs_jax.live.ros import subscribe  # an extra
 
         return subscribe(source.split()[1:], into, needs_camera)
-    shots = open_source(source, into)
-    into.fill(partial(_offer, shots, source, into), f"camera {source}")
+    shots = open_source(source, into) if isinstance(source, str) else source
+    into.fill(partial(_offer, shots, name_of(source), into), f"camera {name_of(source)}")
     return None
+
+
+def name_of(source: str | Iterator[Shot]) -> str:
+    """Name a source in messages."""
+    return source if isinstance(source, str) else "iterator"
 
 
 def is_ros(source: str) -> bool:
@@ -47,16 +52,17 @@ def is_ros(source: str) -> bool:
     return source.split()[:1] == ["ros"]
 
 
-def _offer(shots: Iterator[Shot | Unread], source: str, into: Newest) -> None:
+def _offer(shots: Iterator[Shot | Unread], name: str, into: Newest) -> None:
     try:
         for shot in shots:
             if not into.put(shot):
                 return
-        into.end(f"camera {source} has ended")
-    except ERRORS as error:
-        into.end(f"camera {source} has failed: {error}")
+        into.end(f"camera {name} has ended")
+    except Exception as error:  # whatever it is, no more will come
+        into.end(f"camera {name} has failed: {str(error) or type(error).__name__}")
     finally:
-        shots.close()
+        if isinstance(shots, Generator):
+            shots.close()
 
 
 def open_source(source: str, into: Newest) -> Iterator[Shot | Unread]:

@@ -33,7 +33,7 @@ class Joined:
 
     def add(self, kind: str, time_s: float, value: Any) -> Iterator[tuple[float, dict[str, Any]]]:
         """Add a message of an "image", a "depth" or a "pose" (4, 4); yield what is whole, in order of time."""
-        kept, images = self._waiting[kind], self._waiting["image"]
+        kept = self._waiting[kind]
         if kept and time_s < kept[-1][0] - BACK_S:
             for messages in self._waiting.values():
                 messages.clear()
@@ -41,6 +41,11 @@ class Joined:
         while kept[-1][0] - kept[0][0] > KEPT_S:
             self.num_alone += kind == "image"
             del kept[0]
+        yield from self.whole()
+
+    def whole(self) -> Iterator[tuple[float, dict[str, Any]]]:
+        """Yield the images that are whole by now, in order of time; earlier ones are left out."""
+        images = self._waiting["image"]
         for place, (image_time, image) in enumerate(images):
             found = self._found(image_time)
             if found is not None:

@@ -97,7 +97,7 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
         try:
             value = frames.read_pose(message) if kind == "pose" else message
         except ValueError as error:
-            into.problem = str(error)
+            say(str(error))
             return
         if kind == "image":
             frames.see(message)
@@ -107,13 +107,25 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
         for time_s, found in whole:
             into.put(partial(shot_of, time_s, found))
         if joined.num_alone > num_alone:
-            into.problem = f"{joined.num_alone} images had no {' or '.join(sorted(kinds))} of their time"
-            if odom_frame and not frames.transforms.way(frames.camera, odom_frame):
-                into.problem = f"/tf does not lead from {odom_frame} to {frames.camera or 'a frame in the images'}"
+            is_apart = odom_frame and not frames.transforms.way(frames.camera, odom_frame)
+            say(
+                f"/tf does not lead from {odom_frame} to {frames.camera or 'a frame in the images'}"
+                if is_apart
+                else f"{joined.num_alone} images had no {' or '.join(sorted(kinds))} of their time"
+            )
+
+    def say(problem: str | None = None) -> None:
+        """Keep what is wrong with the images, and with the transforms that they need."""
+        into.problem = "; ".join(filter(None, (problem, frames.transforms.problem))) or into.problem
+
+    def add_fixed(message: Any) -> None:
+        frames.transforms.add_fixed(message)
+        say()
 
     def add_moving(message: Any) -> None:
-        for time_s in frames.transforms.add_moving(message, frames.camera, odom_frame):
-            put(joined.add("pose", time_s, None), joined.num_alone)
+        if frames.transforms.add_moving(message, frames.camera, odom_frame):
+            put(joined.whole(), joined.num_alone)
+        say()
 
     image_type = CompressedImage if topics.get("image", "").endswith("compressed") else Image
     quality, info_topic = qos_profile_sensor_data, node.resolve_topic_name("camera_info")
@@ -133,7 +145,7 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
             raise ValueError(f"odom_frame:={odom_frame} takes poses from /tf, which needs the package tf2_msgs")
         if tf_type is not None:
             kept = QoSProfile(depth=100, durability=DurabilityPolicy.TRANSIENT_LOCAL)
-            node.create_subscription(tf_type, "/tf_static", frames.transforms.add_fixed, kept)
+            node.create_subscription(tf_type, "/tf_static", add_fixed, kept)
         if odom_frame:
             node.create_subscription(tf_type, "/tf", add_moving, QoSProfile(depth=100))
     executor = SingleThreadedExecutor()
@@ -145,18 +157,21 @@ def subscribe(words: Sequence[str], into: Newest, needs_camera: bool) -> Calibra
     while infos.empty() and into.reason is None and time.monotonic() < end:
         time.sleep(0.05)
     if infos.empty():
-        into.end("ended before a camera_info came")
-        raise ValueError(
+        into.end(
             f"no CameraInfo comes on {info_topic} in {INFO_S:g} s: remap it (camera_info:=…), give dataset.intrinsics"
         )
+        raise ValueError(into.reason)
     return calibration_of(infos.get(), topics.get("image", "image"), "ROS")
 
 
 def _spin(executor: Any, node: Any, into: Newest) -> None:
-    """Serve the node's callbacks until no more images are wanted."""
-    with contextlib.suppress(Exception):  # ROS is shut down
+    """Serve the node's callbacks until no more images are wanted, ROS is shut down, or one of them fails."""
+    try:
         while into.reason is None:
             executor.spin_once(timeout_sec=0.1)
+    except Exception as error:
+        into.end(f"camera ros has failed: {str(error) or type(error).__name__}")
+    with contextlib.suppress(Exception):  # ROS is shut down
         node.destroy_node()
 
 

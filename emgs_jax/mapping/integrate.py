@@ -18,12 +18,12 @@ from emgs_jax.back_end.loops import (
 )
 from emgs_jax.back_end.optimization import close_loops, follow_prior, merge_duplicates_of_state
 from emgs_jax.back_end.state import BackEnd, add_node
-from emgs_jax.device.arrays import to_se3
+from emgs_jax.device.arrays import to_matrix, to_se3
 from emgs_jax.device.clock import Clock, Timer
 from emgs_jax.geometry import Sim3
 from emgs_jax.loop_closure.prior_query import PriorQuery
 from emgs_jax.loop_closure.verification import LoopMeasurement
-from emgs_jax.mapping.atlas import Atlas, join_at, with_state
+from emgs_jax.mapping.atlas import Atlas, World, join_at, with_state
 from emgs_jax.mapping.event import NEW_SUBMAP, RELOCALIZED, Event
 from emgs_jax.mapping.finalize import end_looks_of
 from emgs_jax.mapping.tracking import Found, anchor_world, place
@@ -42,7 +42,8 @@ def integrate(
     timer = Timer(clock)
     if window.adjusted and can_follow(atlas):
         with clock.phase("back_end"):
-            graph, state = follow_prior(atlas.graph, atlas.state, window.adjusted, window.T_world_anchor)
+            T_world_anchor = anchor_in_map(atlas.world, window)
+            graph, state = follow_prior(atlas.graph, atlas.state, window.adjusted, T_world_anchor)
         atlas = with_state(replace(atlas, graph=graph), state, atlas.config)
     atlas, event, found = place(atlas, window)
     event = replace(event, seconds=seconds_of(window, timer))
@@ -57,7 +58,13 @@ def integrate(
 def can_follow(atlas: Atlas) -> bool:
     """Test whether the active submap lies in the prior's first world, and a back end moves it."""
     is_there = atlas.state is not None and not atlas.is_frozen and atlas.graph.config is not None
-    return is_there and atlas.world.number == 0 and atlas.world.motion is None
+    return is_there and atlas.world.number == 0
+
+
+def anchor_in_map(world: World, window: WindowInput) -> np.ndarray:
+    """T_world_anchor (4, 4) of the prior's first world, as relocalization has moved it."""
+    motion = np.eye(4) if world.motion is None else to_matrix(world.motion.wxyz_xyz)
+    return motion @ window.T_world_anchor
 
 
 def seconds_of(window: WindowInput, timer: Timer, num_sharing: int = 1) -> Mapping[str, float]:

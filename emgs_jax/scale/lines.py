@@ -6,7 +6,7 @@ from pathlib import Path
 
 def words_of(path: Path) -> Iterator[tuple[int, str, list[str]]]:
     """Yield number, text and words of each line that is neither empty nor a comment; commas separate, too."""
-    for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), start=1):
+    for number, line in enumerate(path.read_text(encoding="utf-8-sig", errors="replace").splitlines(), start=1):
         words = line.replace(",", " ").replace(";", " ").split()
         if words and not words[0].startswith("#"):
             yield number, line, words

@@ -745,6 +745,25 @@ def test_the_map_follows_poses_that_the_prior_changes_and_loops_of_the_graph_giv
     assert [node.pose is other.pose for node, other in zip(same.nodes, end.nodes, strict=True)] == [True, True]
 
 
+@pytest.mark.parametrize("motion", [None, np.eye(4), on_ring([0.3])[0]])
+def test_the_map_follows_also_after_relocalization_has_moved_the_world_of_the_prior(graph, monkeypatch, motion):
+    """Symptom: after one relocalization no adjusted pose was followed for the rest of a run."""
+    M = np.eye(4) if motion is None else motion
+    anchor, old, new = shifted(1.0), shifted(0.0, 0.0, 0.2), shifted(0.0, 0.0, 0.5)
+    poses = [M @ anchor, M @ anchor @ old]
+    nodes = tuple(
+        Node(T, T, 0.0, row, predicted=one) for row, (T, one) in enumerate(zip(poses, (np.eye(4), old), strict=True))
+    )
+    end = BackEnd(graph, (300.0, 300.0, 160.0, 120.0), 0.01, nodes)
+    state = replace(state_of(ring()), time=jnp.asarray(2, jnp.int32))
+    world = World(motion=None if motion is None else to_se3(motion))
+    monkeypatch.setattr(integrate, "place", lambda atlas, window: (atlas, Event(poses[1][None]), None))
+    monkeypatch.setattr(integrate, "update_graph", lambda atlas, *_: atlas)
+    window = SimpleNamespace(seconds={}, adjusted={1: new}, T_world_anchor=anchor)
+    after, _ = integrate.integrate(replace(atlas_of(end, state), world=world), window)
+    np.testing.assert_allclose(after.graph.nodes[1].pose, M @ anchor @ new, atol=1e-6)
+
+
 def test_a_window_factor_follows_what_the_prior_predicts_and_no_estimate(graph):
     """Symptom: after an adjustment it had the difference of the estimates, which says nothing new of the path."""
     state, poses = replace(state_of(ring()), time=jnp.asarray(3, jnp.int32)), [shifted(one) for one in (0.0, 1.0, 2.0)]

@@ -23,7 +23,8 @@ def test_a_name_a_line_has_no_ids_and_an_id_and_a_name_a_line_has_and_0_is_undef
     assert (found.names, found.positions) == (("wall", "tv screen", "2 seater sofa"), None)
     with pytest.raises(ValueError, match=r"classes.txt has names without ids, which x.txt needs: .*`id name`"):
         found.positions_of(np.array([1]), "x.txt")
-    for text in ("7 tv screen\n3 wall\n", "7,tv screen\n3, wall\n"):  # as names, 3 was the fourth
+    # As names, 3 was the fourth; the last one has a byte order mark.
+    for text in ("7 tv screen\n3 wall\n", "7,tv screen\n3, wall\n", "\ufeff7 tv screen\n3 wall\n"):
         found = read_classes(written(tmp_path, text))
         assert found.names == ("tv screen", "wall")
         np.testing.assert_array_equal(found.positions_of(np.array([3, 7, 0, 3]), "x"), [1, 0, -1, 1])

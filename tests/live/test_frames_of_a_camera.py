@@ -4,6 +4,7 @@ import os
 import threading
 import time
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from queue import Queue
 
 import cv2
 import numpy as np
@@ -280,6 +281,29 @@ def test_a_camera_of_the_network_that_stalls_gives_no_more_frames(monkeypatch):
     assert np.diff([frames[row].image.mean() for row in range(len(frames))]).min() > 0, "in order, none twice"
 
 
+def test_an_iterator_of_python_is_a_source():
+    """As docs/live.md says; whatever fails in it ends the frames with its reason."""
+    images = Queue()
+    frames = Camera(source=iter(fed(images, Shot(5.0, an_image(5))).get, None), intrinsics=INTRINSICS, size=(32, 24))
+    fed(images, Shot(6.0, an_image(6), {"T_world_camera": np.eye(4)}))
+    assert frames.has(1) and [frames[row].timestamp for row in (0, 1)] == [5.0, 6.0]
+    np.testing.assert_array_equal(np.load(path_beside(frames, 1))["T_world_camera"], np.eye(4))
+    fed(images, None)
+    assert not frames.has(2) and frames._newest.reason == "camera iterator has ended"
+
+    def broken():
+        yield Shot(0.0, an_image(0))
+        raise KeyError("depth")
+
+    frames = Camera(source=broken(), intrinsics=INTRINSICS)
+    assert not frames.has(1) and frames._newest.reason == "camera iterator has failed: 'depth'"
+
+
+def fed(images: Queue, image: Shot | None) -> Queue:
+    images.put(image)
+    return images
+
+
 @pytest.mark.parametrize("given", [None, "exif"])
 def test_intrinsics_that_a_camera_cannot_tell_are_asked_for_before_it_is_opened(given):
     with pytest.raises(ValueError, match=r"dataset.intrinsics is not set: give \[fx,fy,cx,cy\]"):
@@ -334,6 +358,10 @@ def test_to_estimate_intrinsics_all_images_are_taken_first(source):
     assert seen == [[0, 1]] and frames.total == 2 == wait_for_all(frames) and frames.intrinsics == INTRINSICS
 
 
+def path_beside(frames: Camera, index: int):
+    return frames.files(index)[0].with_suffix(".npz")
+
+
 BENT = (20.0, 20.0, 15.5, 11.5, -0.2, 0.05, 0.0, 0.0)  # a lens whose distortion shows in an image of 32 by 24
 RAMP = np.linspace(1, 2, 24 * 32, dtype=np.float32).reshape(24, 32)
 
@@ -358,8 +386,28 @@ def test_a_recording_is_read_again_as_the_same_frames_with_what_came_beside_them
         beside = np.load(again.files(row)[0].with_suffix(".npz"))
         np.testing.assert_array_equal(beside["depth"], lens.straighten_depth(RAMP))
     assert (lens.straighten_depth(RAMP) != RAMP).any()
+    by_file = Images(**settings | {"intrinsics": str(tmp_path / "recorded" / "camera.json")})
+    assert by_file.fingerprint() == again.fingerprint() and by_file.intrinsics == again.intrinsics
     with pytest.raises(ValueError, match="holds an earlier recording: map it"):
         Camera(source="0", intrinsics=BENT, record=True, folder=tmp_path)
+
+
+@pytest.mark.parametrize("form", [lambda *four: four, lambda fx, fy, cx, cy: [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]])
+def test_intrinsics_beside_a_bent_image_are_replaced_by_those_of_the_straight_one(source, form):
+    """Symptom: the depth was straightened and kept the intrinsics of the bent image; points lay 8 pixels off."""
+    given = {"depth": RAMP, "T_world_camera": np.eye(4)}
+    source.give(Shot(0.0, an_image(0), given | {"intrinsics": np.array(form(*BENT[:4]))}))
+    frames = Camera(source="0", intrinsics=BENT)
+    assert frames.full_intrinsics[0] < BENT[0] - 1 and sorted(given) == sorted(np.load(path_beside(frames, 0)))
+    source.give(Shot(1.0, an_image(1), given | {"intrinsics": np.array(form(*frames.full_intrinsics))}))
+    assert not frames.has(1) and "are not those of the images, [20.0, 20.0" in frames._newest.reason
+
+
+def test_intrinsics_beside_an_image_without_distortion_stay(source):
+    given = {"depth": RAMP[::2, ::2], "T_world_camera": np.eye(4), "intrinsics": np.array([20.0, 20.0, 7.5, 5.5])}
+    source.give(Shot(0.0, an_image(0), given))
+    frames = Camera(source="0", intrinsics=INTRINSICS)
+    np.testing.assert_array_equal(np.load(path_beside(frames, 0))["intrinsics"], given["intrinsics"])
 
 
 @pytest.mark.parametrize(
@@ -416,7 +464,7 @@ def test_only_a_recording_waits_for_the_disk(source, tmp_path, monkeypatch, reco
     monkeypatch.setattr(os, "fsync", synced.append)
     source.give(Shot(0.0, an_image(0), {"depth": np.ones((24, 32), np.float32)}))
     Camera(source="0", intrinsics=INTRINSICS, record=record, folder=tmp_path)
-    assert len(synced) == (2 if record else 0)
+    assert len(synced) == (3 if record else 0), "image, depth and intrinsics"
 
 
 def test_the_last_frame_can_be_left_out_as_if_it_had_not_come(source):

@@ -1,5 +1,7 @@
 """Messages of one moment, in any order; what their bytes mean. Oracles: what was written into them."""
 
+import sys
+import time
 from array import array
 from types import SimpleNamespace
 
@@ -9,7 +11,9 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from emgs_jax.data.base import BadFrameError
+from emgs_jax.live import ros
 from emgs_jax.live.joined_messages import Joined, pose_at
+from emgs_jax.live.newest import Newest
 from emgs_jax.live.ros import Frames, depth_of, image_of, pose_of
 from emgs_jax.live.transforms import Transforms, stamp_of
 
@@ -208,10 +212,11 @@ def test_a_moving_camera_on_a_moving_base_is_where_both_are_at_the_time():
     tree, T_head_camera = Transforms(), random_pose(3)
     tree.add_fixed(transforms([("head", "camera", T_head_camera)]))
     assert tree.pose("camera", "odom", 1.0) is None and tree.way("camera", "odom") == []
-    assert tree.add_moving(transforms([("odom", "base", at(1.0))], 1.0), "camera", "odom") == [], "no way yet"
+    assert not tree.add_moving(transforms([("odom", "base", at(1.0))], 1.0), "camera", "odom"), "no way yet"
     heads = [(0.9, at(0.0, 0.0)), (1.3, at(0.0, 40.0))]
-    asked = [tree.add_moving(transforms([("/base", "/head", T)], t), "camera", "odom") for t, T in heads]
-    assert asked == [[0.9], [1.3]] and tree.way("camera", "odom") == ["camera", "head", "base"]
+    assert all(tree.add_moving(transforms([("/base", "/head", T)], t), "camera", "odom") for t, T in heads)
+    assert not tree.add_moving(transforms([("base", "wheel", at(0))], 1.1), "camera", "odom"), "beside the way"
+    assert tree.way("camera", "odom") == ["camera", "head", "base"]
     assert tree.pose("camera", "odom", 1.1) is None, "where the base is then has not come yet"
     assert tree.add_moving(transforms([("odom", "base", at(3.0)), ("base", "wheel", at(0))], 1.2), "camera", "odom")
     np.testing.assert_allclose(tree.pose("camera", "odom", 1.1), at(2.0) @ at(0.0, 20.0) @ T_head_camera, atol=1e-9)
@@ -235,10 +240,111 @@ def test_an_image_takes_its_pose_from_transforms():
     joined = Joined({"pose"}, {"pose": lambda _, time_s: tree.pose("camera", "odom", time_s)})
     for number in range(4):
         found += joined.add("image", 0.25 * number, number)
-        for time_s in tree.add_moving(transforms([("odom", "camera", at(number))], 0.25 * number), "camera", "odom"):
-            found += joined.add("pose", time_s, None)
+        assert tree.add_moving(transforms([("odom", "camera", at(number))], 0.25 * number), "camera", "odom")
+        found += joined.whole()
     assert [one["image"] for _, one in found] == [0, 1, 2, 3]
     np.testing.assert_allclose([one["pose"][0, 3] for _, one in found], np.arange(4), atol=1e-6)
+
+
+@pytest.fixture
+def topics(monkeypatch):
+    """Subscribe without ROS: a function of the words, which returns the callbacks by topic and where images go."""
+
+    def executor():
+        return SimpleNamespace(add_node=lambda node: None, spin_once=lambda timeout_sec: time.sleep(0.01))
+
+    of = SimpleNamespace
+    stubs = {
+        "rclpy": of(),
+        "rclpy.exceptions": of(InvalidParameterTypeException=TypeError),
+        "rclpy.executors": of(SingleThreadedExecutor=executor),
+        "rclpy.qos": of(
+            DurabilityPolicy=of(TRANSIENT_LOCAL=1), QoSProfile=lambda **_: None, qos_profile_sensor_data=None
+        ),
+        "sensor_msgs.msg": of(CameraInfo=None, CompressedImage=None, Image=None),
+        "nav_msgs.msg": of(Odometry=None),
+    }
+    for name, stub in stubs.items():
+        monkeypatch.setitem(sys.modules, name, stub)
+    monkeypatch.setattr(ros, "message_of_tf", lambda: object)
+    opened = []
+
+    def subscribe(*words: str):
+        given, callbacks, into = dict(word.split(":=") for word in words), {}, Newest()
+        node = of(
+            declare_parameter=lambda name, default: of(value=given.get(name, default)),
+            resolve_topic_name=lambda name: name,
+            create_subscription=lambda kind, topic, callback, quality: callbacks.update({topic: callback}),
+            destroy_node=lambda: None,
+        )
+        monkeypatch.setattr(ros, "new_node", lambda name, words: (None, node))
+        ros.subscribe(words, into, needs_camera=False)
+        opened.append(into)
+        return callbacks, into
+
+    yield subscribe
+    for into in opened:
+        into.close()
+
+
+def an_image(time_s: float, frame: str = "camera"):
+    image = message(RGB, "rgb8")
+    stamp = SimpleNamespace(sec=int(time_s), nanosec=round(time_s % 1 * 1e9))
+    image.header = SimpleNamespace(frame_id=frame, stamp=stamp)
+    return image
+
+
+def bent_transforms(length: float):
+    """One transform of a gripper whose quaternion has this length."""
+    found = transforms([("base", "gripper", at(0.0))])
+    found.transforms[0].transform.rotation.w = length
+    return found
+
+
+@pytest.mark.parametrize("length", [0.0, 1.02])
+def test_a_transform_that_is_not_rigid_is_left_out_and_said_and_the_images_go_on(topics, length):
+    """Symptom: one on /tf, of any frame, ended the camera without a word."""
+    callbacks, into = topics("odom_frame:=odom")
+    for topic in ("/tf", "/tf_static"):
+        into.problem = None
+        callbacks[topic](bent_transforms(length))
+        assert into.problem == "the transform from base to gripper is left out: its quaternion has not length 1"
+    mixed = transforms([("odom", "camera", at(3.0))], 1.0)
+    mixed.transforms.insert(0, bent_transforms(length).transforms[0])
+    callbacks["image"](an_image(1.0)), callbacks["/tf"](mixed)
+    np.testing.assert_array_equal(into.take(1.0).given["T_world_camera"], at(3.0))
+    for number in range(40):
+        callbacks["image"](an_image(2.0 + 0.1 * number))
+    assert "images had no pose of their time; the transform from base to gripper is left out" in into.problem
+
+
+def test_transforms_that_are_dated_ahead_do_not_begin_anew_and_a_bag_that_is_played_again_does(topics):
+    """Symptom: each pose from map to odom, good for seconds to come, and the next of odometry cleared all images."""
+    callbacks, into = topics("odom_frame:=map")
+    for _ in range(2):
+        found = []
+        for number in range(60):
+            time_s = 10.0 + 0.1 * number
+            callbacks["/tf"](transforms([("map", "odom", at(1.0))], time_s + 1.5))
+            if number > 20:  # the first transforms that are dated ahead have come to pass
+                callbacks["image"](an_image(time_s - 0.05))
+            callbacks["/tf"](transforms([("odom", "camera", at(number))], time_s))
+            if (shot := into.take(0.0)) is not None:
+                found.append((shot.time, shot.given["T_world_camera"][0, 3]))
+        assert [x for _, x in found] == pytest.approx([number + 0.5 for number in range(21, 60)])
+
+
+@pytest.mark.parametrize(("error", "words"), [(ValueError("a bad message"), "a bad message"), (OSError(), "OSError")])
+def test_a_callback_that_fails_ends_the_images_with_its_reason(error, words):
+    """Symptom: the thread ended, and a run of a camera waited for images in vain."""
+    is_destroyed, into = [], Newest()
+
+    def spin_once(timeout_sec):
+        raise error
+
+    node = SimpleNamespace(destroy_node=lambda: is_destroyed.append(True))
+    ros._spin(SimpleNamespace(spin_once=spin_once), node, into)
+    assert into.reason == f"camera ros has failed: {words}" and is_destroyed
 
 
 def test_compressed_depths_are_metres():

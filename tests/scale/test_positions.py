@@ -69,9 +69,11 @@ def test_positions_by_name(tmp_path):
     assert np.isnan(found[5]).all()
 
 
-def test_a_trajectory_of_tum_is_read_by_its_times(tmp_path):
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+def test_a_trajectory_of_tum_is_read_by_its_times(tmp_path, mark):
+    """With a byte order mark, as Windows writes it, too: it hid the number of the first line."""
     path = tmp_path / "path.txt"
-    path.write_text("".join(f"{1305031100 + 0.1 * row:.3f} {row} 0 1 0 0 0 1\n" for row in range(5)))
+    path.write_text(mark + "".join(f"{1305031100 + 0.1 * row:.3f} {row} 0 1 0 0 0 1\n" for row in range(5)), "utf-8")
     found = read_positions(path, NAMES, [1305031100.01 + 0.1 * row for row in range(4)] + [1305031150.0])
     assert found[:4, 0] == pytest.approx([0, 1, 2, 3]) and np.isnan(found[4]).all()
 

@@ -162,14 +162,13 @@ class MultiviewStereo(Prior):
     def predict(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction:
         """Predict; a view that is in no model has NaN and no valid point."""
         structure = self._take(max(window.views))
-        return replace(self._predicted(structure, window), adjusted=self._adjusted(structure, window.current))
+        return replace(self._predicted(structure, window), adjusted=self._adjusted(structure, window))
 
     def _predicted(self, structure: Structure, window: Window) -> PriorPrediction:
         world = self._world_at(window.current)
         T, spread = np.full((len(window.views), 4, 4), np.nan), np.full((len(window.views), 6, 6), np.nan)
         anchor = window.views[0]
-        is_same = structure.world[anchor] == world
-        T_anchor_world = np.linalg.inv(structure.T_world_camera[anchor]) if is_same else np.eye(4)
+        T_anchor_world = from_world(structure, anchor, world)
         for row, frame in enumerate(window.views):
             if structure.world[frame] == world:
                 T[row] = np.eye(4) if frame == anchor else T_anchor_world @ structure.T_world_camera[frame]
@@ -178,13 +177,13 @@ class MultiviewStereo(Prior):
         scale_std = np.float64(self._depths(current).scale_std) if structure.is_placed[current] else None
         return predicted(window, T, dense, pose_covariance=spread, scale_std=scale_std, world=world)
 
-    def _adjusted(self, structure: Structure, current: int) -> dict[int, np.ndarray]:
-        """The poses of earlier frames, relative to the first, where all were adjusted since the last call."""
+    def _adjusted(self, structure: Structure, window: Window) -> dict[int, np.ndarray]:
+        """The poses of earlier frames, as they are predicted now, where all were adjusted since the last call."""
         was, self._num_adjusted = self._num_adjusted, structure.num_adjusted
-        if was == structure.num_adjusted or structure.world[0] == NONE:
+        if was == structure.num_adjusted:
             return {}
-        T = np.linalg.inv(structure.T_world_camera[0]) @ structure.T_world_camera
-        return {frame: T[frame] for frame in range(current) if structure.is_placed[frame]}
+        T = from_world(structure, window.views[0], 0) @ structure.T_world_camera
+        return {frame: T[frame] for frame in range(window.current) if structure.world[frame] == 0}
 
     def revisit(self, window: Window, frames: Sequence[Frame], intrinsics: Sequence[float]) -> PriorPrediction | None:
         """Predict for views of two visits of a place; None unless they are in one world."""
@@ -298,3 +297,9 @@ class MultiviewStereo(Prior):
     def _difference(self, depth: np.ndarray, seen: Sources) -> np.ndarray:
         step = jnp.float32(self._dense.depth_step)
         return np.asarray(jitted_difference(jnp.asarray(depth), seen, self._camera, step))
+
+
+def from_world(structure: Structure, anchor: int, world: int) -> np.ndarray:
+    """T_anchor_world (4, 4); the identity where the anchor has no pose there, such as a first image that is dark."""
+    is_there = structure.world[anchor] == world
+    return np.linalg.inv(structure.T_world_camera[anchor]) if is_there else np.eye(4)
