@@ -139,6 +139,10 @@ class ReadableFrames:
         """What is left out of `full`, bool (h, w); None without a mask."""
         return self._left_out(self.kept[index], self.size if self.full_intrinsics is None else self._dataset.raw_size)
 
+    @property
+    def raw_size(self) -> tuple[int, int]:
+        return self._dataset.raw_size
+
     def pixel_of(self, index: int, pixel: np.ndarray) -> np.ndarray:
         """The column and row, in frame `index`, of a pixel of its image on disk."""
         return self._dataset.pixel_of(self.kept[index], pixel)

@@ -202,6 +202,12 @@ def test_pixels_without_depth_and_images_not_in_use_are_named(tmp_path):
         measured(tmp_path, ScaleConfig(distance=["a99", 20, 100, 60, 110, 1.0]))
 
 
+def test_a_pixel_outside_of_the_image_is_named(tmp_path):
+    """Symptom: "no depth is known … choose points with texture", for pixels of a larger copy of the photo."""
+    with pytest.raises(ValueError, match=r"no pixel \[3000, 1000\] on disk: images are 160x120"):
+        measured(tmp_path, ScaleConfig(distance=["a03", 60, 110, 3000, 1000, 1.0]))
+
+
 def test_no_floor_is_said(tmp_path):
     with pytest.raises(ValueError, match="no floor was found below the cameras"):
         metres_of(
