@@ -71,6 +71,14 @@ class ScaleConfig:
         return [*self.distance] if is_several else [self.distance]
 
     @property
+    def files(self) -> dict[str, Path]:
+        """Files and folders by the key that names them."""
+        imu = self.imu and self.imu.partition(":/")[0]
+        named = {"imu": imu, "T_imu_camera": self.T_imu_camera, "positions": self.positions}
+        known = {key: value for key, value in named.items() if isinstance(value, str)}
+        return {key: Path(value).expanduser() for key, value in known.items() if value not in ("exif", "dataset")}
+
+    @property
     def is_given(self) -> bool:
         """Whether there is any source."""
         return bool(self.distances) or any(value is not None for value in (self.height, self.positions, self.imu))

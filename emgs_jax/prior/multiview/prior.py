@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from emgs_jax.data.base import Dataset, Frame, wait_for_all
 from emgs_jax.data.masks import check_names, names_of
+from emgs_jax.data.reading import contents
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import UP_KEYS, DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
@@ -90,6 +91,9 @@ class MultiviewStereo(Prior):
             settings["scale"] = jsonable(asdict(metres))
         if metres.positions == "dataset" and structure.model is None:
             settings["poses"] = "dataset"
+        model = {} if structure.model is None else {"model": Path(structure.model).expanduser()}
+        if files := metres.files | model:
+            settings["contents"] = {key: contents(path) for key, path in files.items()}
         self.provenance = Provenance("multiview_stereo", {"version": 15} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None

@@ -70,6 +70,28 @@ def test_frames_of_a_doubtful_model_are_counted(tmp_path, doubtful, percent):
     assert "prior/doubtful_percent" not in given.report()
 
 
+def test_files_that_tell_scale_or_structure_count_by_their_contents(tmp_path):
+    """Symptom: positions were corrected from feet to metres, and a stopped run went on in the old unit."""
+
+    def settings(*words):
+        return build(compose("prior=multiview_stereo", *words), "prior").provenance.settings
+
+    (tmp_path / "model" / "0").mkdir(parents=True)
+    mounted = "scale.T_imu_camera=[1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]"
+    for name, *words in (
+        ("positions.txt", f"scale.positions={tmp_path}/positions.txt"),
+        ("walk.bag", f"scale.imu={tmp_path}/walk.bag:/imu", mounted),
+        ("sensor.yaml", "scale.imu=imu.csv", f"scale.T_imu_camera={tmp_path}/sensor.yaml"),
+        ("model/0/cameras.txt", f"prior.structure.model={tmp_path}/model"),
+    ):
+        (tmp_path / name).write_text("a00.jpg 3.28 0 0")
+        before = settings(*words)
+        assert settings(*words) == before
+        (tmp_path / name).write_text("a00.jpg 1 0 0")
+        assert settings(*words) != before
+    assert "contents" not in settings("scale.positions=exif")
+
+
 def test_a_structure_is_made_at_the_poses_of_the_data_set_if_these_are_the_positions(tmp_path, monkeypatch):
     asked = []
     monkeypatch.setattr(module, "structure_of", lambda *given: asked.append(given[-1]) or (drawn(), False))
