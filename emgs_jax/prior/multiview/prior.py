@@ -102,7 +102,7 @@ class MultiviewStereo(Prior):
         self._lenses: dict[tuple, Lens] = {}
         self._num_adjusted = 0
         self._scale_std: float | None = None
-        self._up: np.ndarray | None = None  # in the axes of the first frame with a pose
+        self._up: tuple[np.ndarray, int] | None = None  # in the axes of a frame's camera, and the frame
 
     def num_newer(self, window_size: int) -> int:
         """All but one: a structure knows all images, so the first frame alone begins the map. None online."""
@@ -141,7 +141,7 @@ class MultiviewStereo(Prior):
         """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models.
 
         Of models that were made here also `prior/doubtful_percent`: frames of those that are said to be doubtful.
-        In metres also `prior/scale_std_percent`, and `prior/up_x`, y, z, see `UP_KEYS`, if a source tells up.
+        In metres also `prior/scale_std_percent`, and `prior/up_x`, … (`UP_KEYS`), if a source tells up.
         """
         if self._known is None:
             return {}
@@ -152,7 +152,10 @@ class MultiviewStereo(Prior):
         if doubtful is not None:
             is_doubtful = [name in doubtful for name in names_of(self._dataset)]
             known["prior/doubtful_percent"] = 100 * float(np.mean(self._known.is_placed & is_doubtful))
-        known |= {} if self._up is None else dict(zip(UP_KEYS, map(float, self._up), strict=True))
+        if self._up is not None:
+            up, frame = self._up
+            index = getattr(self._dataset, "kept", range(len(self._dataset)))[frame]
+            known |= dict(zip(UP_KEYS, [*map(float, up), index], strict=True))
         return {"prior/placed_percent": placed, "prior/num_worlds": len(self._known.worlds)} | known
 
     @property
@@ -251,7 +254,8 @@ class MultiviewStereo(Prior):
             factors[world] = 1.0 if scale is None else scale.factor
         self._scale_std = next(scale.std for scale, *_ in each if scale is not None)
         if each[0].up is not None:  # worlds are in the order of their first frames
-            self._up = found.T_world_camera[np.flatnonzero(found.is_placed)[0], :3, :3].T @ each[0].up
+            first = int(np.flatnonzero(found.is_placed)[0])
+            self._up = found.T_world_camera[first, :3, :3].T @ each[0].up, first
         in_metres = scaled(found, factors)
 
         def depth_in_metres(frame: int) -> Depth:

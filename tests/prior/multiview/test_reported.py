@@ -56,7 +56,11 @@ def test_up_by_a_source_of_the_scale_is_reported_in_the_first_cameras_axes(tmp_p
         report = prior.report()
         assert report["prior/scale_std_percent"] == pytest.approx(3.0)
         assert (UP_KEYS[0] in report) == (up is not None)
-    np.testing.assert_allclose(TURN @ [report[key] for key in UP_KEYS], UP)
+    *up, index = (report[key] for key in UP_KEYS)
+    np.testing.assert_allclose(TURN @ up, UP)
+    assert index == 1
+    prior._dataset.kept = [2, 4, 5, 6]  # of the images on disk
+    assert prior.report()[UP_KEYS[-1]] == 4
 
 
 @pytest.mark.parametrize(("doubtful", "percent"), [(["p1.png", "p3.png", "p0.png"], 50.0), ([], 0.0), (None, None)])
