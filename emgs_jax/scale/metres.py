@@ -116,7 +116,7 @@ def metres_of(
         scales: what else is known of each world's scale, such as by a network.
 
     Raises:
-        ValueError: a source cannot be read, or says nothing of any world.
+        ValueError: a source cannot be read, or all say nothing of the largest world.
     """
     names, read = names_of(dataset), _read(config, dataset)
     found = []
@@ -125,8 +125,11 @@ def metres_of(
         own += filter(None, scales[one : one + 1])
         scale, warning = combined(own) if own else (None, None)
         found.append(Metres(scale, up, tuple(filter(None, [warning, *notes]))))
-    if all(one.scale is None for one in found):
-        raise ValueError("scale: " + "; ".join(note for one in found for note in one.notes))
+    sizes = np.bincount(world[world >= 0])
+    largest = found[int(sizes.argmax())]
+    if largest.scale is None:
+        of = f" of the largest model, of {sizes.max()} of {len(world)} images" if len(found) > 1 else ""
+        raise ValueError(f"scale{of}: {'; '.join(largest.notes)}")
     return found
 
 

@@ -178,6 +178,8 @@ def test_each_model_has_its_own_scale(tmp_path):
     first, second = measured(tmp_path, config, world=[0] * 6 + [1] * 6)
     assert first.scale is not None and second.scale is None
     assert "image a03.jpg of scale.distance has no pose in this model" in second.notes
+    with pytest.raises(ValueError, match=r"^scale of the largest model, of 8 of 12 images: image a03.jpg of scale.dis"):
+        measured(tmp_path, config, world=[0] * 4 + [1] * 8)
     with pytest.raises(ValueError, match=r"^scale: image a03.jpg of scale.distance has no pose in this model$"):
         measured(tmp_path, config, world=[0] * 3 + [-1] + [0] * 8)
 

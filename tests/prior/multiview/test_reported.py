@@ -7,8 +7,9 @@ import pytest
 from scene import compose
 
 from emgs_jax.config.configure import build
-from emgs_jax.prior.base import UP_KEYS
+from emgs_jax.prior.base import UP_KEYS, Window
 from emgs_jax.prior.multiview import prior as module
+from emgs_jax.prior.multiview.dense import Depth
 from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.metres import Metres
 from emgs_jax.structure.model import NONE, Structure, World
@@ -30,13 +31,13 @@ class Photos:
         return [self.folder / f"p{index}.jpg"]
 
 
-def drawn():
+def drawn(world=(NONE, 0, 0, 0)):
     """The first frame has no pose."""
     T = np.full((4, 4, 4), np.nan)
     T[1:] = np.eye(4)
     T[1, :3, :3] = TURN
-    worlds = [World(np.zeros((0, 3)), None)]
-    return Structure(worlds, np.array([NONE, 0, 0, 0]), T, np.zeros((4, 6, 6)), [np.zeros(0, int)] * 4)
+    worlds = [World(np.zeros((0, 3)), None)] * (max(world) + 1)
+    return Structure(worlds, np.array(world), T, np.zeros((4, 6, 6)), [np.zeros(0, int)] * 4)
 
 
 def begun(folder, *words):
@@ -61,6 +62,23 @@ def test_up_by_a_source_of_the_scale_is_reported_in_the_first_cameras_axes(tmp_p
     assert index == 1
     prior._dataset.kept = [2, 4, 5, 6]  # of the images on disk
     assert prior.report()[UP_KEYS[-1]] == 4
+
+
+def test_a_model_whose_scale_is_unknown_has_no_poses_in_a_run_in_metres(tmp_path, monkeypatch, capfd):
+    """Symptom: it kept its unit, which was called metres, also where it was the first, whose unit the map has."""
+    prior, known = begun(tmp_path, "scale.height=1.5"), Metres(Scale("height", np.log(2.0), 0.03), UP, ())
+    monkeypatch.setattr(module, "metres_of", lambda *given: [Metres(None, None, ("no floor",)), known])
+    prior._answer = lambda frame: (np.zeros((2, 2, 3)), np.ones((2, 2)), np.ones((2, 2), bool))
+    prior._depths = lambda frame: Depth(np.ones((2, 2), np.float32), None, None, 0.1)
+    prior._known = drawn((NONE, 0, 1, 1))
+    prior._to_metres(prior._known, ())
+    assert "model 0: unknown, so no pose for its images (1); no floor" in capfd.readouterr().out
+    report = prior.report()
+    assert report["prior/placed_percent"] == 50 and report[UP_KEYS[-1]] == 2
+    prior._up_to = lambda frame: prior._known
+    predicted = prior.predict(Window(0, (0, 1, 2, 3), (2, 3), 3), (), ())
+    assert np.isnan(predicted.T_anchor_view[1]).all() and np.isfinite(predicted.T_anchor_view[2:]).all()
+    assert predicted.world == 0, "the map has the first world's unit"
 
 
 @pytest.mark.parametrize(("doubtful", "percent"), [(["p1.png", "p3.png", "p0.png"], 50.0), ([], 0.0), (None, None)])
