@@ -142,6 +142,10 @@ class ReadableFrames:
     def stored_pixels(self, index: int) -> np.ndarray | None:
         return self._dataset.stored_pixels(self.kept[index])
 
+    @property
+    def raw_size(self) -> tuple[int, int]:
+        return self._dataset.raw_size
+
     def pixel_of(self, index: int, pixel: np.ndarray) -> np.ndarray:
         """The column and row, in frame `index`, of a pixel of its image on disk."""
         return self._dataset.pixel_of(self.kept[index], pixel)

@@ -411,6 +411,12 @@ def fingerprint(root: Path, files: Iterable[Path], options: dict[str, object]) -
     return digest.hexdigest()
 
 
+def contents(path: Path) -> str:
+    """Hex digest of a file, or of those in a folder and its numbered ones, such as models of COLMAP or a bag."""
+    files = [path, *path.glob("*"), *path.glob("[0-9]*/*")]
+    return fingerprint(path, (file for file in files if file.is_file()), {})
+
+
 def _content(path: Path) -> str:
     """Digest of a file's bytes; empty if it cannot be read."""
     try:

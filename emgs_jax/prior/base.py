@@ -10,7 +10,8 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
 
-UP_KEYS = "prior/up_x", "prior/up_y", "prior/up_z"  # in a report: up in the axes of the first frame with a pose
+# In a report: up in the axes of a frame's camera, and the frame's index in the data set, as in frames.jsonl.
+UP_KEYS = "prior/up_x", "prior/up_y", "prior/up_z", "prior/up_frame"
 
 
 @dataclass(frozen=True)

@@ -160,10 +160,13 @@ def to_export(run: FinishedRun, factor: float | None, up: str) -> Sim3 | None:
 
 
 def measured_up(run: FinishedRun) -> np.ndarray | None:
-    """Return up in a run's world, (3,), by what told its scale (floor, positions, inertial unit); None without such."""
-    if UP_KEYS[0] not in run.metrics or not run.is_placed.any():
-        return None
-    return run.poses[run.is_placed][0, :3, :3] @ [run.metrics[key] for key in UP_KEYS]
+    """Return up in a run's world, (3,), by what told its scale (floor, positions, inertial unit).
+
+    It is known by one frame; None where that has no pose, and without such a source.
+    """
+    *up, index = (run.metrics.get(key) for key in UP_KEYS)
+    rows = [row for row in np.flatnonzero(run.is_placed) if run.frames[row]["index"] == index]
+    return run.poses[rows[0], :3, :3] @ up if rows else None
 
 
 def write_moved(run: FinishedRun, folder: Path, T_export_map: Sim3) -> FinishedRun:

@@ -71,9 +71,17 @@ class ScaleConfig:
         return [*self.distance] if is_several else [self.distance]
 
     @property
+    def files(self) -> dict[str, Path]:
+        """Files and folders by the key that names them."""
+        imu = self.imu and self.imu.partition(":/")[0]
+        named = {"imu": imu, "T_imu_camera": self.T_imu_camera, "positions": self.positions}
+        known = {key: value for key, value in named.items() if isinstance(value, str)}
+        return {key: Path(value).expanduser() for key, value in known.items() if value not in ("exif", "dataset")}
+
+    @property
     def is_given(self) -> bool:
         """Whether there is any source."""
-        return any(value is not None for value in (self.distance, self.height, self.positions, self.imu))
+        return bool(self.distances) or any(value is not None for value in (self.height, self.positions, self.imu))
 
 
 class View(NamedTuple):
@@ -108,7 +116,7 @@ def metres_of(
         scales: what else is known of each world's scale, such as by a network.
 
     Raises:
-        ValueError: a source cannot be read, or says nothing of any world.
+        ValueError: a source cannot be read, or all say nothing of the largest world.
     """
     names, read = names_of(dataset), _read(config, dataset)
     found = []
@@ -117,8 +125,11 @@ def metres_of(
         own += filter(None, scales[one : one + 1])
         scale, warning = combined(own) if own else (None, None)
         found.append(Metres(scale, up, tuple(filter(None, [warning, *notes]))))
-    if all(one.scale is None for one in found):
-        raise ValueError("scale: " + "; ".join(note for one in found for note in one.notes))
+    sizes = np.bincount(world[world >= 0])
+    largest = found[int(sizes.argmax())]
+    if largest.scale is None:
+        of = f" of the largest model, of {sizes.max()} of {len(world)} images" if len(found) > 1 else ""
+        raise ValueError(f"scale{of}: {'; '.join(largest.notes)}")
     return found
 
 
@@ -157,7 +168,7 @@ def _of_world(
         if frame not in frames:
             notes.append(f"image {image} of scale.distance has no pose in this model")
             continue
-        ends = [point_at(*view(frame), dataset.pixel_of(frame, np.array(pixels[k : k + 2]))) for k in (0, 2)]
+        ends = [_point(dataset, view, frame, pixels[k : k + 2]) for k in (0, 2)]
         if None in ends:
             unknown = pixels[:2] if ends[0] is None else pixels[2:]
             raise ValueError(
@@ -212,6 +223,16 @@ def _frame_of(image: str, names: Sequence[str]) -> int:
     )
 
 
+def _point(
+    dataset: Dataset, view: Callable[[int], View], frame: int, pixel: Sequence[float]
+) -> tuple[Float[np.ndarray, "3"], float] | None:
+    """The point at a pixel of a frame's image on disk, see `point_at`; ValueError for a pixel outside of that."""
+    (x, y), (width, height) = pixel, dataset.raw_size
+    if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
+        raise ValueError(f"scale.distance: there is no pixel {[*pixel]} on disk: images are {width}x{height}")
+    return point_at(*view(frame), dataset.pixel_of(frame, np.array(pixel)), np.array(dataset.intrinsics[:2]))
+
+
 def _spread(
     point: Float[np.ndarray, "3"],
     frames: Int[np.ndarray, " k"],
@@ -226,7 +247,8 @@ def _spread(
         if depth > 0 and ((pixel >= 0) & (pixel <= size - 1)).all():
             found.append((int(frame), pixel, depth))
     rows = np.unique(np.linspace(0, len(found) - 1, min(NUM_BESIDE, len(found))).round().astype(int))
-    said = [(found[row][2], point_at(*view(found[row][0]), found[row][1])) for row in rows]
+    focal = np.array(dataset.intrinsics[:2])
+    said = [(found[row][2], point_at(*view(found[row][0]), found[row][1], focal)) for row in rows]
     known = [(depth, float(seen[0][2])) for depth, seen in said if seen is not None]
     return spread_of([depth for depth, _ in known], [seen for _, seen in known])
 

@@ -10,6 +10,7 @@ from jaxtyping import Float
 from PIL import ExifTags, Image
 
 from emgs_jax.data.camera_models import load_pycolmap
+from emgs_jax.data.file_names import last_number
 from emgs_jax.data.timestamps import in_seconds, nearest_rows
 from emgs_jax.geometry import Sim3, similarity_of
 from emgs_jax.scale.estimate import Scale
@@ -106,16 +107,17 @@ def is_geographic(path: Path) -> bool:
 def read_positions(path: Path, names: Sequence[str], times: Sequence[float]) -> Float[np.ndarray, "n 3"]:
     """Read a position for each frame, metres; NaN where there is none.
 
-    A line has the name of an image, or a time in seconds, and x y z in metres; further words are not read, so a
-    trajectory of TUM will do. After a first line `EPSG:4326` they are longitude, latitude and altitude, as in ODM's
-    geo.txt.
+    A line has the name of an image, its number or a time in seconds, and x y z in metres; further words are not read,
+    so a trajectory of TUM will do. After a first line `EPSG:4326` they are longitude, latitude and altitude, as in
+    ODM's geo.txt.
 
     Args:
         names: of the frames, without suffix.
         times: of the frames, seconds.
 
     Raises:
-        ValueError: a line cannot be read, or fewer than `MIN_POSITIONS` frames have a position.
+        ValueError: a line cannot be read, whole numbers may be those of frames and seconds, or fewer than
+            `MIN_POSITIONS` frames have a position.
     """
     if not path.is_file():
         raise ValueError(f"scale.positions={path} is no file: give one, exif or dataset")
@@ -137,13 +139,7 @@ def read_positions(path: Path, names: Sequence[str], times: Sequence[float]) -> 
         keys.append(words[0])
         values.append(place)
     table, found = np.array(values, np.float64).reshape(-1, 3), np.full((len(names), 3), np.nan)
-    stems = {Path(key).stem: row for row, key in enumerate(keys)}
-    rows = [stems.get(name, -1) for name in names]
-    if max(rows, default=-1) < 0 and keys and (clock := numbers_in(keys)) is not None:
-        order = np.argsort(clock, kind="stable")
-        clock = in_seconds(np.array(clock)[order])
-        near = nearest_rows(np.asarray(times, np.float64), clock, MAX_TIME_DIFFERENCE)
-        rows = [int(order[row]) if row >= 0 else -1 for row in near]
+    rows = _rows_of(path, keys, names, times)
     for frame, row in enumerate(rows):
         if row >= 0:
             found[frame] = table[row, [1, 0, 2]] if is_geographic else table[row]
@@ -154,6 +150,37 @@ def read_positions(path: Path, names: Sequence[str], times: Sequence[float]) -> 
             f"with {', '.join(keys[:3])}, the images are called {', '.join(names[:3])}"
         )
     return _in_metres(found) if is_geographic else found
+
+
+def _rows_of(path: Path, keys: Sequence[str], names: Sequence[str], times: Sequence[float]) -> list[int]:
+    """Row of each frame by its name, by the last number of its name, or by its time; -1 without one.
+
+    Raises:
+        ValueError: whole numbers fit frames as their numbers, not one to one, and otherwise as seconds.
+    """
+    stems = {Path(key).stem: row for row, key in enumerate(keys)}
+    by_name = [stems.get(name, -1) for name in names]
+    clock = numbers_in(keys)
+    if clock is None:
+        return by_name
+    numbers = [last_number(name) for name in names]
+    is_counted = all(key.isdecimal() for key in keys) and len({*numbers}) == len(numbers)
+    counted = {int(key): row for row, key in enumerate(keys)} if is_counted else {}
+    by_number = [counted.get(number, -1) for number in numbers]
+    if max(by_name, default=-1) >= 0:
+        return by_number if is_counted else by_name
+    order = np.argsort(clock, kind="stable")
+    near = nearest_rows(np.asarray(times, np.float64), in_seconds(np.array(clock)[order]), MAX_TIME_DIFFERENCE)
+    by_time = [int(order[row]) if row >= 0 else -1 for row in near]
+    if counted.keys() == {*numbers} or by_number == by_time:
+        return by_number
+    num_counted, num_timed = (len({*rows} - {-1}) for rows in (by_number, by_time))
+    if min(num_counted, num_timed) >= MIN_POSITIONS:
+        raise ValueError(
+            f"{path}: its lines begin with {', '.join(keys[:3])}, which may be numbers of frames or seconds: write "
+            f"names, such as {names[0]}, for the former, and seconds with a point, such as {float(clock[0])}"
+        )
+    return by_number if num_counted > num_timed else by_time
 
 
 def scale_of_positions(centers: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], source: str) -> Placed:

@@ -24,9 +24,14 @@ def scale_of_distance(
         points: in the camera's axes, any unit.
         depth_std: of the logarithm of each depth.
         focal: in pixels of the frame.
+
+    Raises:
+        ValueError: the points are one.
     """
     apart = points[1] - points[0]
     units = float(np.linalg.norm(apart))
+    if not units > 0:
+        raise ValueError(f"scale.distance: both pixels of {source} show one point: choose points far apart")
     along = points @ (apart / units) * depth_std
     beside = CLICK_STD * points[:, 2] / focal
     variance = max(float(along @ along) / units**2, float(np.mean(depth_std)) ** 2) + float(beside @ beside) / units**2
@@ -34,15 +39,20 @@ def scale_of_distance(
 
 
 def point_at(
-    points: Float[np.ndarray, "h w 3"], std: Float[np.ndarray, "h w"], pixel: Float[np.ndarray, "2"]
+    points: Float[np.ndarray, "h w 3"],
+    std: Float[np.ndarray, "h w"],
+    pixel: Float[np.ndarray, "2"],
+    focal: Float[np.ndarray, "2"],
 ) -> tuple[Float[np.ndarray, "3"], float] | None:
     """Return the point of a frame at a pixel, and the standard deviation of the logarithm of its depth.
 
-    The depth is the median within `REACH` pixels. If it varies there, as at an edge, its spread counts.
+    It is on the ray of the pixel itself, which those of its neighbours tell, with the median depth within `REACH`
+    pixels. If that varies there, as at an edge, its spread counts.
 
     Args:
         points: in the camera's axes, 0 where there is none.
         pixel: column and row.
+        focal: fx and fy in pixels of the frame.
 
     Returns:
         None where no depth is known near the pixel, or outside of the frame.
@@ -50,16 +60,19 @@ def point_at(
     column, row = np.rint(pixel).astype(int)
     if not (0 <= row < len(points) and 0 <= column < points.shape[1]):
         return None
+    rows, columns = np.indices(std.shape)
     near = slice(max(row - REACH, 0), row + REACH + 1), slice(max(column - REACH, 0), column + REACH + 1)
-    some, stds = points[near].reshape(-1, 3), std[near].reshape(-1)
-    stds, some = stds[some[:, 2] > 0], some[some[:, 2] > 0].astype(np.float64)
-    if not len(some):
+    is_known = points[near][..., 2] > 0
+    if not is_known.any():
         return None
+    some, stds = points[near][is_known].astype(np.float64), std[near][is_known]
+    pixels = np.stack([columns[near][is_known], rows[near][is_known]], axis=-1)
     logs = np.log(some[:, 2])
     middle = float(np.median(logs))
     spread = 1.4826 * float(np.median(np.abs(logs - middle)))
-    nearest = some[np.argmin(np.abs(logs - middle))]
-    return nearest, float(np.hypot(np.median(stds), spread))
+    depth = some[np.argmin(np.abs(logs - middle)), 2]
+    on_plane = np.median(some[:, :2] / some[:, 2:] + (pixel - pixels) / focal, axis=0)
+    return depth * np.append(on_plane, 1.0), float(np.hypot(np.median(stds), spread))
 
 
 def pixel_in(

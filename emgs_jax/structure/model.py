@@ -118,6 +118,13 @@ def in_unit(structure: Structure, median_depth: float) -> Structure:
     return scaled(structure, factors)
 
 
+def without_worlds(structure: Structure, numbers: Sequence[int]) -> Structure:
+    """Take the poses from the frames of some worlds, whose numbers stay."""
+    is_out = np.isin(structure.world, numbers)
+    T = np.where(is_out[:, None, None], np.nan, structure.T_world_camera)
+    return replace(structure, world=np.where(is_out, NONE, structure.world), T_world_camera=T)
+
+
 def scaled(structure: Structure, factors: Sequence[float]) -> Structure:
     """Multiply the lengths of each world by its factor."""
     T, covariance = structure.T_world_camera.copy(), structure.covariance.copy()

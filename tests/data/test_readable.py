@@ -40,7 +40,7 @@ def test_skipping_leaves_out_exactly_the_unreadable_frames_and_renumbers_the_res
     frames = ReadableFrames(Damaged(1, 4), "skip")
     assert frames.skipped == {1: "1.png is truncated", 4: "4.png is truncated"}
     assert [(frame.index, frame.timestamp) for frame in frames] == [(0, 0.0), (1, 20.0), (2, 30.0)]
-    assert frames.kept == [0, 2, 3] and len(frames) == 3
+    assert frames.kept == [0, 2, 3] and len(frames) == 3 and frames.raw_size == (4, 3)
     whole, without_1, without_2 = (ReadableFrames(Damaged(*bad), "skip").fingerprint() for bad in ((), (1,), (2,)))
     assert whole == "whole" and len({whole, without_1, without_2}) == 3
 

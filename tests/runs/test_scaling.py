@@ -194,11 +194,14 @@ def test_z_is_up_in_a_turned_export_of_all_files_alike_and_the_run_stays(run, ca
 
 
 def test_up_is_that_of_the_source_which_told_the_scale(run):
-    """Known in the first camera's axes, whatever cameras and walls say."""
+    """Known in a camera's axes, whatever cameras and walls say; symptom: those of the first one placed were taken."""
     up = np.array([0.6, 0.0, 0.8])
-    known = replace(run, metrics=run.metrics | dict(zip(UP_KEYS, map(float, run.poses[0, :3, :3].T @ up), strict=True)))
+    told = [*map(float, run.poses[2, :3, :3].T @ up), run.frames[2]["index"]]
+    known = replace(run, metrics=run.metrics | dict(zip(UP_KEYS, told, strict=True)))
     np.testing.assert_allclose(measured_up(known), up, atol=1e-9)
     np.testing.assert_allclose(to_export(known, None, "z").rotation @ up, [0.0, 0.0, 1.0], atol=1e-9)
+    lost = replace(known, frames=[*run.frames[:2], run.frames[2] | {"status": "lost"}, *run.frames[3:]])
+    assert measured_up(lost) is None
     assert measured_up(run) is None and to_export(known, None, "run") is None
 
 

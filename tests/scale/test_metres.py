@@ -178,6 +178,8 @@ def test_each_model_has_its_own_scale(tmp_path):
     first, second = measured(tmp_path, config, world=[0] * 6 + [1] * 6)
     assert first.scale is not None and second.scale is None
     assert "image a03.jpg of scale.distance has no pose in this model" in second.notes
+    with pytest.raises(ValueError, match=r"^scale of the largest model, of 8 of 12 images: image a03.jpg of scale.dis"):
+        measured(tmp_path, config, world=[0] * 4 + [1] * 8)
     with pytest.raises(ValueError, match=r"^scale: image a03.jpg of scale.distance has no pose in this model$"):
         measured(tmp_path, config, world=[0] * 3 + [-1] + [0] * 8)
 
@@ -200,6 +202,12 @@ def test_pixels_without_depth_and_images_not_in_use_are_named(tmp_path):
         measured(tmp_path, ScaleConfig(distance=["a03", 20, 1, 60, 110, 1.0]))
     with pytest.raises(ValueError, match="image a99 is not in use: there are a00 to a11"):
         measured(tmp_path, ScaleConfig(distance=["a99", 20, 100, 60, 110, 1.0]))
+
+
+def test_a_pixel_outside_of_the_image_is_named(tmp_path):
+    """Symptom: "no depth is known … choose points with texture", for pixels of a larger copy of the photo."""
+    with pytest.raises(ValueError, match=r"no pixel \[3000, 1000\] on disk: images are 160x120"):
+        measured(tmp_path, ScaleConfig(distance=["a03", 60, 110, 3000, 1000, 1.0]))
 
 
 def test_no_floor_is_said(tmp_path):

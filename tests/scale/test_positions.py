@@ -78,6 +78,35 @@ def test_a_trajectory_of_tum_is_read_by_its_times(tmp_path, mark):
     assert found[:4, 0] == pytest.approx([0, 1, 2, 3]) and np.isnan(found[4]).all()
 
 
+VIDEO = [f"{index:06}" for index in range(300)], [index / 30 for index in range(300)]
+
+
+def numbered(path, numbers, form="{}"):
+    path.write_text("".join(f"{form.format(number)} {number} 0 1\n" for number in numbers))
+    return path
+
+
+def test_numbers_of_frames_are_no_seconds(tmp_path):
+    """Symptom: lines 0, 1, 2, … of a video were seconds, and a straight walk had a thirtieth of its scale."""
+    path = numbered(tmp_path / "path.txt", range(300))
+    assert (read_positions(path, *VIDEO)[:, 0] == np.arange(300)).all()
+    assert (read_positions(path, [f"frame-{name}.color" for name in VIDEO[0]], VIDEO[1])[:, 0] == np.arange(300)).all()
+    later = [1.7e9 + time for time in VIDEO[1]]
+    assert (read_positions(numbered(path, range(0, 300, 3)), VIDEO[0], later)[::3, 0] == np.arange(0, 300, 3)).all()
+    mixed = [f"{index:03}" for index in range(990, 1010)]  # some are names as well
+    found = read_positions(numbered(path, range(990, 1010)), mixed, [index / 30 for index in range(20)])
+    assert (found[:, 0] == np.arange(990, 1010)).all()
+
+
+def test_whole_numbers_that_fit_as_frames_and_as_seconds_are_refused(tmp_path):
+    """Ten seconds of GPS once a second, or positions of the first eleven frames."""
+    path = tmp_path / "path.txt"
+    with pytest.raises(ValueError, match=r"begin with 0, 1, 2, .* such as 000000, .* such as 0.0"):
+        read_positions(numbered(path, range(11)), *VIDEO)
+    assert (read_positions(numbered(path, range(11), "{:06}"), *VIDEO)[:11, 0] == np.arange(11)).all()
+    assert (read_positions(numbered(path, range(11), "{}.0"), *VIDEO)[[0, 30, 270], 0] == [0, 1, 9]).all()
+
+
 def test_geographic_positions_are_longitude_first(tmp_path):
     path = tmp_path / "geo.txt"
     path.write_text(

@@ -22,6 +22,7 @@ from tqdm import tqdm
 
 from emgs_jax.data.base import Dataset, Frame, wait_for_all
 from emgs_jax.data.masks import check_names, names_of
+from emgs_jax.data.reading import contents
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
 from emgs_jax.prior.base import UP_KEYS, DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
@@ -39,7 +40,7 @@ from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.metres import ScaleConfig, View, metres_of
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import names_at
-from emgs_jax.structure.model import NONE, Structure, median_depth, scaled
+from emgs_jax.structure.model import NONE, Structure, median_depth, scaled, without_worlds
 from emgs_jax.structure.sequence import follow_images, structure_of
 from emgs_jax.structure.store import doubtful_in
 
@@ -90,15 +91,19 @@ class MultiviewStereo(Prior):
             settings["scale"] = jsonable(asdict(metres))
         if metres.positions == "dataset" and structure.model is None:
             settings["poses"] = "dataset"
+        model = {} if structure.model is None else {"model": Path(structure.model).expanduser()}
+        if files := metres.files | model:
+            settings["contents"] = {key: contents(path) for key, path in files.items()}
         self.provenance = Provenance("multiview_stereo", {"version": 15} | settings)
         self._dataset: Dataset | None = None
         self._folder: Path | None = None
         self._up_to: Callable[[int], Structure] | None = None  # of the frames up to this one, at least
         self._known: Structure | None = None
+        self._newest = lambda: self._known  # in metres where these are known
         self._lenses: dict[tuple, Lens] = {}
         self._num_adjusted = 0
         self._scale_std: float | None = None
-        self._up: np.ndarray | None = None  # in the axes of the first frame with a pose
+        self._up: tuple[np.ndarray, int] | None = None  # in the axes of a frame's camera, and the frame
 
     def num_newer(self, window_size: int) -> int:
         """All but one: a structure knows all images, so the first frame alone begins the map. None online."""
@@ -137,19 +142,23 @@ class MultiviewStereo(Prior):
         """Return `prior/placed_percent`: frames with a pose in a model, `prior/num_worlds`: number of models.
 
         Of models that were made here also `prior/doubtful_percent`: frames of those that are said to be doubtful.
-        In metres also `prior/scale_std_percent`, and `prior/up_x`, y, z, see `UP_KEYS`, if a source tells up.
+        In metres also `prior/scale_std_percent`, and `prior/up_x`, … (`UP_KEYS`), if a source tells up.
         """
-        if self._known is None:
+        found = self._newest()
+        if found is None:
             return {}
-        placed = 100 * float(self._known.is_placed.mean())
+        placed = 100 * float(found.is_placed.mean())
         known = {} if self._scale_std is None else {"prior/scale_std_percent": 100 * self._scale_std}
         is_own = self._config.model is None and not self._config.online
         doubtful = doubtful_in(self._folder) if is_own else None
         if doubtful is not None:
             is_doubtful = [name in doubtful for name in names_of(self._dataset)]
-            known["prior/doubtful_percent"] = 100 * float(np.mean(self._known.is_placed & is_doubtful))
-        known |= {} if self._up is None else dict(zip(UP_KEYS, map(float, self._up), strict=True))
-        return {"prior/placed_percent": placed, "prior/num_worlds": len(self._known.worlds)} | known
+            known["prior/doubtful_percent"] = 100 * float(np.mean(found.is_placed & is_doubtful))
+        if self._up is not None:
+            up, frame = self._up
+            index = getattr(self._dataset, "kept", range(len(self._dataset)))[frame]
+            known |= dict(zip(UP_KEYS, [*map(float, up), index], strict=True))
+        return {"prior/placed_percent": placed, "prior/num_worlds": len(found.worlds)} | known
 
     @property
     def metre(self) -> float:
@@ -175,7 +184,8 @@ class MultiviewStereo(Prior):
                 spread[row] = structure.covariance[frame]
         dense, current = [self._answer(frame) for frame in window.dense], window.current
         scale_std = np.float64(self._depths(current).scale_std) if structure.is_placed[current] else None
-        return predicted(window, T, dense, pose_covariance=spread, scale_std=scale_std, world=world)
+        number = int(np.searchsorted(np.unique(structure.world[structure.is_placed]), world))
+        return predicted(window, T, dense, pose_covariance=spread, scale_std=scale_std, world=number)
 
     def _adjusted(self, structure: Structure, window: Window) -> dict[int, np.ndarray]:
         """The poses of earlier frames, as they are predicted now, where all were adjusted since the last call."""
@@ -208,7 +218,6 @@ class MultiviewStereo(Prior):
         self._up_to, self._is_straight = self._begin()
         if not self._config.online:
             self._known = self._up_to(0)
-        self._newest = lambda: self._known
         depths, scales = self._way.begin(Scene(self._dataset, self._newest, self._lens, self._camera))
         self._depths = lru_cache(NUM_KEPT)(depths)  # a frame's neighbours ask for its depth again
         if self._metres.is_given or any(scales):
@@ -226,7 +235,7 @@ class MultiviewStereo(Prior):
         return lambda frame: found, is_straight
 
     def _to_metres(self, found: Structure, scales: Sequence[Scale | None]) -> None:
-        """Bring structure and depths into metres by the lengths that are known; other worlds keep their unit.
+        """Bring structure and depths into metres by the lengths that are known; frames of other worlds lose their pose.
 
         Args:
             scales: of each world, by depths in metres; empty without such.
@@ -241,13 +250,16 @@ class MultiviewStereo(Prior):
         factors = np.ones(len(each))
         for world, (scale, _, notes) in enumerate(each):
             of = f" of model {world}" if len(each) > 1 else ""
-            said = ["unknown"] if scale is None else [f"± {100 * scale.std:.1f} %, by {scale.source}"]
+            lost = f"unknown, so no pose for its images ({np.sum(found.world == world)})"
+            said = [lost] if scale is None else [f"± {100 * scale.std:.1f} %, by {scale.source}"]
             tqdm.write(f"scale{of}: {'; '.join([*said, *notes])}")
             factors[world] = 1.0 if scale is None else scale.factor
-        self._scale_std = next(scale.std for scale, *_ in each if scale is not None)
-        if each[0].up is not None:  # worlds are in the order of their first frames
-            self._up = found.T_world_camera[np.flatnonzero(found.is_placed)[0], :3, :3].T @ each[0].up
-        in_metres = scaled(found, factors)
+        self._scale_std = max(scale.std for scale, *_ in each if scale is not None)
+        unknown = [world for world, (scale, *_) in enumerate(each) if scale is None]
+        in_metres = without_worlds(scaled(found, factors), unknown)
+        first = int(np.flatnonzero(in_metres.is_placed)[0])
+        up = each[in_metres.world[first]].up
+        self._up = None if up is None else (found.T_world_camera[first, :3, :3].T @ up, first)
 
         def depth_in_metres(frame: int) -> Depth:
             one = depths(frame)

@@ -7,8 +7,9 @@ import pytest
 from scene import compose
 
 from emgs_jax.config.configure import build
-from emgs_jax.prior.base import UP_KEYS
+from emgs_jax.prior.base import UP_KEYS, Window
 from emgs_jax.prior.multiview import prior as module
+from emgs_jax.prior.multiview.dense import Depth
 from emgs_jax.scale.estimate import Scale
 from emgs_jax.scale.metres import Metres
 from emgs_jax.structure.model import NONE, Structure, World
@@ -30,13 +31,13 @@ class Photos:
         return [self.folder / f"p{index}.jpg"]
 
 
-def drawn():
+def drawn(world=(NONE, 0, 0, 0)):
     """The first frame has no pose."""
     T = np.full((4, 4, 4), np.nan)
     T[1:] = np.eye(4)
     T[1, :3, :3] = TURN
-    worlds = [World(np.zeros((0, 3)), None)]
-    return Structure(worlds, np.array([NONE, 0, 0, 0]), T, np.zeros((4, 6, 6)), [np.zeros(0, int)] * 4)
+    worlds = [World(np.zeros((0, 3)), None)] * (max(world) + 1)
+    return Structure(worlds, np.array(world), T, np.zeros((4, 6, 6)), [np.zeros(0, int)] * 4)
 
 
 def begun(folder, *words):
@@ -56,7 +57,28 @@ def test_up_by_a_source_of_the_scale_is_reported_in_the_first_cameras_axes(tmp_p
         report = prior.report()
         assert report["prior/scale_std_percent"] == pytest.approx(3.0)
         assert (UP_KEYS[0] in report) == (up is not None)
-    np.testing.assert_allclose(TURN @ [report[key] for key in UP_KEYS], UP)
+    *up, index = (report[key] for key in UP_KEYS)
+    np.testing.assert_allclose(TURN @ up, UP)
+    assert index == 1
+    prior._dataset.kept = [2, 4, 5, 6]  # of the images on disk
+    assert prior.report()[UP_KEYS[-1]] == 4
+
+
+def test_a_model_whose_scale_is_unknown_has_no_poses_in_a_run_in_metres(tmp_path, monkeypatch, capfd):
+    """Symptom: it kept its unit, which was called metres, also where it was the first, whose unit the map has."""
+    prior, known = begun(tmp_path, "scale.height=1.5"), Metres(Scale("height", np.log(2.0), 0.03), UP, ())
+    monkeypatch.setattr(module, "metres_of", lambda *given: [Metres(None, None, ("no floor",)), known])
+    prior._answer = lambda frame: (np.zeros((2, 2, 3)), np.ones((2, 2)), np.ones((2, 2), bool))
+    prior._depths = lambda frame: Depth(np.ones((2, 2), np.float32), None, None, 0.1)
+    prior._known = drawn((NONE, 0, 1, 1))
+    prior._to_metres(prior._known, ())
+    assert "model 0: unknown, so no pose for its images (1); no floor" in capfd.readouterr().out
+    report = prior.report()
+    assert report["prior/placed_percent"] == 50 and report[UP_KEYS[-1]] == 2
+    prior._up_to = lambda frame: prior._known
+    predicted = prior.predict(Window(0, (0, 1, 2, 3), (2, 3), 3), (), ())
+    assert np.isnan(predicted.T_anchor_view[1]).all() and np.isfinite(predicted.T_anchor_view[2:]).all()
+    assert predicted.world == 0, "the map has the first world's unit"
 
 
 @pytest.mark.parametrize(("doubtful", "percent"), [(["p1.png", "p3.png", "p0.png"], 50.0), ([], 0.0), (None, None)])
@@ -68,6 +90,28 @@ def test_frames_of_a_doubtful_model_are_counted(tmp_path, doubtful, percent):
     assert begun(tmp_path).report().get("prior/doubtful_percent") == percent
     given = begun(tmp_path, "prior.structure.model=elsewhere")
     assert "prior/doubtful_percent" not in given.report()
+
+
+def test_files_that_tell_scale_or_structure_count_by_their_contents(tmp_path):
+    """Symptom: positions were corrected from feet to metres, and a stopped run went on in the old unit."""
+
+    def settings(*words):
+        return build(compose("prior=multiview_stereo", *words), "prior").provenance.settings
+
+    (tmp_path / "model" / "0").mkdir(parents=True)
+    mounted = "scale.T_imu_camera=[1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]"
+    for name, *words in (
+        ("positions.txt", f"scale.positions={tmp_path}/positions.txt"),
+        ("walk.bag", f"scale.imu={tmp_path}/walk.bag:/imu", mounted),
+        ("sensor.yaml", "scale.imu=imu.csv", f"scale.T_imu_camera={tmp_path}/sensor.yaml"),
+        ("model/0/cameras.txt", f"prior.structure.model={tmp_path}/model"),
+    ):
+        (tmp_path / name).write_text("a00.jpg 3.28 0 0")
+        before = settings(*words)
+        assert settings(*words) == before
+        (tmp_path / name).write_text("a00.jpg 1 0 0")
+        assert settings(*words) != before
+    assert "contents" not in settings("scale.positions=exif")
 
 
 def test_a_structure_is_made_at_the_poses_of_the_data_set_if_these_are_the_positions(tmp_path, monkeypatch):
