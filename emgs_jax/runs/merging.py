@@ -26,6 +26,7 @@ from emgs_jax.mapping.merging import beside, join, motion, with_lost, without_re
 from emgs_jax.mapping.records import FrameRecord, to_line, with_moved_nodes, with_unjoined_apart
 from emgs_jax.mapping.run import MappingRun, with_truth
 from emgs_jax.ops.camera import Camera
+from emgs_jax.prior.base import UP_KEYS
 from emgs_jax.runs.dense import DenseMap, center_cloud, dense_map, voxel_of
 from emgs_jax.runs.files import save_outputs, save_progress
 from emgs_jax.runs.finished_run import FRAMES_FILE, POINTS_FILE, TEXT_FILE, FinishedRun, read_run
@@ -35,6 +36,7 @@ from emgs_jax.runs.provenance import git_now, write_metrics
 from emgs_jax.runs.repeat import repeat
 from emgs_jax.runs.results import METRICS_FILE
 
+SCALE_STD = "prior/scale_std_percent"
 OF_DATA = "name", "sequence"  # keys of a provenance's data
 MIN_SAME, MAX_MOVED = 0.5, 0.02  # keypoints that an image has again, and how far off, of its longer side
 
@@ -301,10 +303,15 @@ def save_merged(
     notes = save_outputs(folder, run, dense, densify, title, evaluation.alignment == "sim3", unit)
     if parts[0].text is not None:
         save_text(folder / TEXT_FILE, parts[0].text)
-    metrics |= describe(run) | score_back_end(run) | {"provenance": origin}
+    metrics |= describe(run) | score_back_end(run) | world_of(parts[0].metrics) | {"provenance": origin}
     write_metrics(folder / METRICS_FILE, metrics)
     apart = [f"{read[n].finished.folder} is not joined, and in submaps/ as it is: {why}" for n, why in reasons.items()]
     return metrics, [*apart, *notes, *filter(None, [note])]
+
+
+def world_of(metrics: Mapping[str, Any]) -> dict[str, Any]:
+    """Choose what is known of the unit and of up in a run, whose world the merged one has."""
+    return {key: metrics[key] for key in (SCALE_STD, *UP_KEYS) if key in metrics}
 
 
 def kept_cloud(parts: Sequence[MergeableRun], nodes: Sequence[Node], voxel: float) -> PointCloud:

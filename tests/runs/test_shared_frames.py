@@ -17,7 +17,7 @@ from emgs_jax.geometry import Sim3, pose_difference
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe, PlaceRecognitionConfig, make_keyframe
 from emgs_jax.mapping.merging import shared_placement, without_repeats
 from emgs_jax.mapping.records import FrameRecord
-from emgs_jax.runs.merging import first_placed, is_same_image, shared_frames
+from emgs_jax.runs.merging import first_placed, is_same_image, shared_frames, world_of
 
 
 def keyframe(row: int, image: int, depth: float = 1.0) -> Keyframe:
@@ -125,6 +125,18 @@ def test_a_node_that_another_one_stands_for_is_named_nowhere(first):
     assert after.tolist() == [row if row < 3 else {3: 1, 4: 2, 5: 3}[row] for row in births]
     assert int(found.state.time) == len(kept)
     np.testing.assert_array_equal(found.state.map.gaussians.means, before.gaussians.means)
+
+
+def test_a_merged_run_has_what_the_first_knows_of_its_unit_and_of_up():
+    known = {
+        "prior/scale_std_percent": 2.0,
+        "prior/up_x": 0.0,
+        "prior/up_y": -1.0,
+        "prior/up_z": 0.0,
+        "prior/up_frame": 1,
+    }
+    assert world_of(known | {"prior/frames_without_pose": 3, "trajectory/scale": 1.0}) == known
+    assert world_of({"trajectory/scale": 1.0}) == {}
 
 
 def test_joined_images_are_shown_once():
