@@ -209,6 +209,9 @@ def _of_world(
             scales.append(motion.scale)
             up = motion.up
             notes.append(f"gravity by the imu (± {motion.up_std_deg:.1f}°)")
+            if motion.late:
+                side = "ahead of" if motion.late > 0 else "behind"
+                notes.append(f"times of images are {1000 * abs(motion.late):.0f} ms {side} the imu's, which is mended")
     return scales, up, notes
 
 
