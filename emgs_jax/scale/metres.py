@@ -125,6 +125,8 @@ def metres_of(
         own += filter(None, scales[one : one + 1])
         scale, warning = combined(own) if own else (None, None)
         found.append(Metres(scale, up, tuple(filter(None, [warning, *notes]))))
+    if not found:
+        raise ValueError("scale: no image has a pose")
     sizes = np.bincount(world[world >= 0])
     largest = found[int(sizes.argmax())]
     if largest.scale is None:
