@@ -22,7 +22,7 @@ import numpy as np
 from jaxtyping import Float
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import OptimizeResult, least_squares
-from scipy.spatial.transform import Rotation
+from scipy.spatial.transform import Rotation, Slerp
 
 from emgs_jax.data.rosbag import is_bag, read_imu
 from emgs_jax.data.timestamps import in_seconds
@@ -35,6 +35,7 @@ WINDOW = 10.0  # seconds of a window
 MIN_FRAMES = 8  # of a window
 MAX_GAP = 2.0  # seconds between frames that the gyroscope bridges
 MIN_SECONDS = 3.0  # of a path
+MAX_LATE, LATE_STEP = 0.2, 0.01  # seconds between two clocks that are mended
 # Root mean square by which rates may turn a window's frames otherwise than their rotations: degrees, or a share of how
 # far these turn. Of right ones it is .01, of a clock that is a twentieth of a second off .25, of other axes 1.5.
 MAX_TURNED_OFF = 5.0, 0.5
@@ -63,6 +64,7 @@ class Motion(NamedTuple):
     up_std_deg: float
     gyroscope_bias: Float[np.ndarray, "3"]  # rad/s
     accelerometer_bias: Float[np.ndarray, "3"]  # m/s²
+    late: float  # seconds that the frames' clock was ahead of the unit's; 0 unless it is surely so
 
 
 class Window(NamedTuple):
@@ -133,13 +135,15 @@ def scale_of_motion(
     """Find scale, gravity and biases of a path.
 
     Args:
-        times: of the frames in seconds, ascending, by the clock of the unit.
+        times: of the frames in seconds, ascending, by the clock of the unit or within `MAX_LATE` of it.
         T_world_camera: their poses, in any unit of length.
         T_imu_camera: camera → unit, metres.
 
     Raises:
         ValueError: fewer than `MIN_SECONDS` of the path were measured, or its accelerations are not those measured.
     """
+    late = _late(times, Rotation.from_matrix(T_world_camera[:, :3, :3] @ T_imu_camera[:3, :3].T), measured)
+    times = times - late
     is_inside = (times >= measured.times[0]) & (times <= measured.times[-1])
     at, poses = times[is_inside], T_world_camera[is_inside]
     parts = _windows(at)
@@ -161,11 +165,41 @@ def scale_of_motion(
             f"{source}: the accelerations are not those of this path: check T_imu_camera, the axes and the clock"
         )
     unknowns, std, up, up_std = solved
-    return Motion(Scale(source, -float(unknowns[0]), std), up, up_std, bias + unknowns[4:7], unknowns[1:4])
+    return Motion(Scale(source, -float(unknowns[0]), std), up, up_std, bias + unknowns[4:7], unknowns[1:4], late)
 
 
 def _span(times: Float[np.ndarray, "n"]) -> str:
     return f"{times[0]:.3f} to {times[-1]:.3f} s" if len(times) else "no time"
+
+
+def _late(times: Float[np.ndarray, "n"], rotations: Rotation, measured: Inertial) -> float:
+    """Seconds by which the frames' clock is ahead of the unit's; 0 unless that is surely so.
+
+    From frame to frame both turn alike, but for a bias. Where the sum of squares J of what is left has its least, σ² of
+    the seconds is 2 J / (k J″) with k residuals.
+    """
+    is_inside = (times >= measured.times[0] + MAX_LATE) & (times <= measured.times[-1] - MAX_LATE)
+    if is_inside.sum() < MIN_FRAMES:
+        return 0.0
+    times, rotations = times[is_inside], rotations[is_inside]
+    seconds, turned = np.diff(times), Slerp(measured.times, _turned(measured, np.zeros(3)))
+    near = seconds <= MAX_GAP
+    steps, seconds = (rotations[:-1].inv() * rotations[1:]).as_rotvec()[near], seconds[near, None]
+
+    def left(late: float) -> float:
+        at = turned(np.clip(times - late, measured.times[0], measured.times[-1]))
+        off = (at[:-1].inv() * at[1:]).as_rotvec()[near] - steps
+        return float(np.sum((off - seconds * off.sum(axis=0) / seconds.sum()) ** 2))
+
+    tried = np.arange(-MAX_LATE, MAX_LATE + LATE_STEP / 2, LATE_STEP)
+    sums = np.array([left(late) for late in tried])
+    best = int(sums.argmin())
+    if not 0 < best < len(tried) - 1:
+        return 0.0
+    before, least, after = sums[best - 1 : best + 2]
+    bend = (before - 2 * least + after) / LATE_STEP**2
+    late, std = tried[best] + (before - after) / (2 * bend * LATE_STEP), (2 * least / (steps.size * bend)) ** 0.5
+    return float(late) if abs(late) > 3 * std else 0.0
 
 
 def _windows(times: Float[np.ndarray, "n"]) -> list[np.ndarray]:

@@ -125,6 +125,8 @@ def metres_of(
         own += filter(None, scales[one : one + 1])
         scale, warning = combined(own) if own else (None, None)
         found.append(Metres(scale, up, tuple(filter(None, [warning, *notes]))))
+    if not found:
+        raise ValueError("scale: no image has a pose")
     sizes = np.bincount(world[world >= 0])
     largest = found[int(sizes.argmax())]
     if largest.scale is None:
@@ -209,6 +211,9 @@ def _of_world(
             scales.append(motion.scale)
             up = motion.up
             notes.append(f"gravity by the imu (± {motion.up_std_deg:.1f}°)")
+            if motion.late:
+                side = "ahead of" if motion.late > 0 else "behind"
+                notes.append(f"times of images are {1000 * abs(motion.late):.0f} ms {side} the imu's, which is mended")
     return scales, up, notes
 
 

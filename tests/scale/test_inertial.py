@@ -24,7 +24,8 @@ def walk(seed=0, noise=0.0, unit=0.37, errors=True):
     acceleration = (-size * (2 * np.pi * waves[:3]) ** 2 * np.sin(arg)).sum(axis=1)
     angles = (0.25 * np.sin(2 * np.pi * waves[3:] * t[:, None, None] + phases[3:])).sum(axis=1)
     rotation = Rotation.from_euler("xyz", angles)
-    rates = np.vstack([(rotation[:-1].inv() * rotation[1:]).as_rotvec() * RATE, np.zeros(3)])
+    rates = np.zeros((len(t), 3))
+    rates[1:-1] = (rotation[:-2].inv() * rotation[2:]).as_rotvec() * RATE / 2
     force = rotation.inv().apply(acceleration + [0, 0, GRAVITY])
     if errors:
         rates = rates + BIASES[0] + 2e-3 * rng.normal(size=rates.shape)
@@ -40,8 +41,7 @@ def walk(seed=0, noise=0.0, unit=0.37, errors=True):
     world[:3, :3] = turn
     poses = world @ poses
     poses[:, :3, 3] = unit * poses[:, :3, 3] + [4.0, 5.0, 6.0]
-    half = 0.5 / RATE  # rates are between two times
-    return t[rows], poses, Inertial(t, rates, force), turn[:, 2], half
+    return t[rows], poses, Inertial(t, rates, force), turn[:, 2]
 
 
 def angle(a, b) -> float:
@@ -49,7 +49,7 @@ def angle(a, b) -> float:
 
 
 def test_scale_gravity_and_biases_are_found():
-    times, poses, measured, up, _ = walk()
+    times, poses, measured, up = walk()
     motion = scale_of_motion(times, poses, measured, T_IMU_CAMERA, "imu")
     assert motion.scale.factor == pytest.approx(1 / 0.37, rel=0.01)
     assert angle(motion.up, up) < 0.5
@@ -83,11 +83,27 @@ def test_rates_that_turn_otherwise_than_the_frames_are_an_error(wrong):
         scale_of_motion(times + late, poses, measured._replace(rates=rates), mounted, "imu")
 
 
+@pytest.mark.parametrize("late", [0.05, -0.15])
+def test_clocks_that_are_not_one_are_mended(late):
+    """Symptom: 50 ms made the scale 3.5 % wrong, ± 1.1 %, and 80 ms 12.7 %, ± 2.7 %."""
+    times, poses, measured, up = walk(4, noise=0.01)
+    motion = scale_of_motion(times + late, poses, measured, T_IMU_CAMERA, "imu")
+    assert motion.late == pytest.approx(late, abs=2e-3)
+    assert abs(motion.scale.log + np.log(0.37)) < 3 * motion.scale.std < 0.01 and angle(motion.up, up) < 1
+
+
+def test_one_clock_stays_as_it_is():
+    times, poses, measured, _ = walk(4, noise=0.01)
+    turns = Rotation.from_rotvec(np.radians(0.1) * np.random.default_rng(0).normal(size=(len(poses), 3)))
+    poses[:, :3, :3] = poses[:, :3, :3] @ turns.as_matrix()
+    assert scale_of_motion(times, poses, measured, T_IMU_CAMERA, "imu").late == 0.0
+
+
 @pytest.mark.slow
 def test_the_scale_of_motions_is_calibrated():
     off, tilt = [], []
     for seed in range(12):
-        times, poses, measured, up, _ = walk(seed, noise=0.01)
+        times, poses, measured, up = walk(seed, noise=0.01)
         motion = scale_of_motion(times, poses, measured, T_IMU_CAMERA, "imu")
         off.append((motion.scale.log + np.log(0.37)) / motion.scale.std)
         tilt.append(angle(motion.up, up))

@@ -182,6 +182,8 @@ def test_each_model_has_its_own_scale(tmp_path):
         measured(tmp_path, config, world=[0] * 4 + [1] * 8)
     with pytest.raises(ValueError, match=r"^scale: image a03.jpg of scale.distance has no pose in this model$"):
         measured(tmp_path, config, world=[0] * 3 + [-1] + [0] * 8)
+    with pytest.raises(ValueError, match="no image has a pose"):
+        measured(tmp_path, config, world=[-1] * 12)
 
 
 def test_a_tape_outweighs_a_network_which_alone_gives_its_scale(tmp_path):
