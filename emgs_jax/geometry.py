@@ -59,11 +59,19 @@ def nearest_rotation(matrix: Float[np.ndarray, "3 3"]) -> Float[np.ndarray, "3 3
     return U @ np.diag([1.0, 1.0, np.linalg.det(U @ Vt)]) @ Vt
 
 
-def similarity_of(x: Float[np.ndarray, "n 3"], y: Float[np.ndarray, "n 3"]) -> Sim3:
-    """Return the least-squares similarity from points x, which differ, to y (Umeyama 1991); any turn about a line."""
+def similarity_of(
+    x: Float[np.ndarray, "n 3"],
+    y: Float[np.ndarray, "n 3"],
+    rotation: Float[np.ndarray, "3 3"] | None = None,
+    with_scale: bool = True,
+) -> Sim3:
+    """Return the least-squares similarity from points x to y (Umeyama 1991), of a given rotation or scale 1.
+
+    Points along a line leave the turn about it open; to find a scale, x must differ.
+    """
     covariance = (y - y.mean(0)).T @ (x - x.mean(0))
-    rotation = nearest_rotation(covariance)
-    scale = float(np.trace(rotation.T @ covariance) / np.sum((x - x.mean(0)) ** 2))
+    rotation = nearest_rotation(covariance) if rotation is None else rotation
+    scale = float(np.trace(rotation.T @ covariance) / np.sum((x - x.mean(0)) ** 2)) if with_scale else 1.0
     return Sim3(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
 
 

@@ -7,7 +7,7 @@ import numpy as np
 
 from emgs_jax.data.pose_conventions import EXPECTED, READINGS
 from emgs_jax.data.timestamps import nearest_rows, resolution
-from emgs_jax.geometry import Sim3, nearest_rotation, pose_difference
+from emgs_jax.geometry import Sim3, nearest_rotation, pose_difference, similarity_of
 
 MIN_ODD_DEG, MIN_GAIN = 1.0, 3.0  # rotation per motion, and factor by which another convention must fit better
 _MAX_ROLL_STD = 0.25  # rad; above, orientations determine the roll about a path better than its positions
@@ -42,7 +42,7 @@ def align(estimate: np.ndarray, reference: np.ndarray, with_scale: bool) -> Sim3
     for name, points in (("estimate", estimate), ("reference", reference)):
         if with_scale and _spread(points) < _MIN_SPREAD_M:
             raise DegenerateTrajectoryError(f"the {name} does not move: no scale can be estimated")
-    return _solve(estimate, reference, _covariance(estimate, reference), with_scale)
+    return similarity_of(estimate, reference, with_scale=with_scale)
 
 
 def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tuple[Sim3, str | None]:
@@ -54,18 +54,18 @@ def align_poses(estimate: np.ndarray, truth: np.ndarray, with_scale: bool) -> tu
     x, y = _checked(np.asarray(estimate)[:, :3, 3], np.asarray(truth)[:, :3, 3], 1)
     orientations = np.einsum("nij,nkj->ik", np.asarray(truth)[:, :3, :3], np.asarray(estimate)[:, :3, :3]) / len(x)
     if len(x) < 3 or min(_spread(x), _spread(y)) < _MIN_SPREAD_M:
-        return _solve(x, y, orientations, False), f"{len(x)} poses without enough motion: aligned by orientation"
-    covariance = _covariance(x, y)
-    u, singular, vt = np.linalg.svd(covariance)
-    found = _solve(x, y, covariance, with_scale)
+        found = similarity_of(x, y, nearest_rotation(orientations), with_scale=False)
+        return found, f"{len(x)} poses without enough motion: aligned by orientation"
+    u, singular, vt = np.linalg.svd((y - y.mean(0)).T @ (x - x.mean(0)) / len(x))
+    found = similarity_of(x, y, with_scale=with_scale)
     # n positions of error σ determine the roll about their line to σ / (w √n), where w is their spread beside it.
     least = ate(x, y, found) ** 2 / (len(x) * _MAX_ROLL_STD**2)
     if singular[1] > max(1e-6 * singular[0], least):
         return found, None
     # The spread beside the line is noise. A term too small to turn the line determines the roll.
     line = singular[0] * np.outer(u[:, 0], vt[0])
-    rotation = _solve(x, y, line + 1e-5 * singular[0] * orientations, False).rotation
-    return _solve(x, y, covariance, with_scale, rotation), "straight path: roll about it aligned by orientation"
+    rotation = nearest_rotation(line + 1e-5 * singular[0] * orientations)
+    return similarity_of(x, y, rotation, with_scale), "straight path: roll about it aligned by orientation"
 
 
 def ate(estimate: np.ndarray, reference: np.ndarray, alignment: Sim3) -> float:
@@ -138,15 +138,6 @@ def check_conventions(estimate: np.ndarray, truth: np.ndarray, source: str) -> N
         )
 
 
-def _solve(
-    x: np.ndarray, y: np.ndarray, covariance: np.ndarray, with_scale: bool, rotation: np.ndarray | None = None
-) -> Sim3:
-    """Solve for the rotation that maximises trace(Rᵀ · covariance), unless it is given, then scale and translation."""
-    rotation = nearest_rotation(covariance) if rotation is None else rotation
-    scale = float(np.trace(rotation.T @ covariance)) / _spread(x) ** 2 if with_scale else 1.0
-    return Sim3(scale, rotation, y.mean(0) - scale * rotation @ x.mean(0))
-
-
 def _checked(estimate: np.ndarray, reference: np.ndarray, minimum: int) -> tuple[np.ndarray, np.ndarray]:
     estimate, reference = np.asarray(estimate, np.float64), np.asarray(reference, np.float64)
     if estimate.shape != reference.shape:
@@ -156,10 +147,6 @@ def _checked(estimate: np.ndarray, reference: np.ndarray, minimum: int) -> tuple
     if not (np.isfinite(estimate).all() and np.isfinite(reference).all()):
         raise DegenerateTrajectoryError("a pose is not finite")
     return estimate, reference
-
-
-def _covariance(x: np.ndarray, y: np.ndarray) -> np.ndarray:
-    return (y - y.mean(0)).T @ (x - x.mean(0)) / len(x)
 
 
 def _nearest(queries: np.ndarray, values: np.ndarray) -> np.ndarray:

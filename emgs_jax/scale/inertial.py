@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from scipy.integrate import cumulative_trapezoid
 from scipy.optimize import OptimizeResult, least_squares
 from scipy.spatial.transform import Rotation, Slerp
@@ -39,6 +39,7 @@ MAX_LATE, LATE_STEP = 0.2, 0.01  # seconds between two clocks that are mended
 # Root mean square by which rates may turn a window's frames otherwise than their rotations: degrees, or a share of how
 # far these turn. Of right ones it is .01, of a clock that is a twentieth of a second off .25, of other axes 1.5.
 MAX_TURNED_OFF = 5.0, 0.5
+MAX_STD = 1.0  # of the log of a scale
 BIASES_STD = 0.5, 0.003  # m/s² and rad/s: of the accelerometer, and what frames' rotations leave of the gyroscope's
 BIAS_STEP = 1e-4  # rad/s, for the change of P
 # Errors of the acceleration, m/s² and the seconds for which they stay: a tilt of .4° mixes .07 m/s² of gravity into it.
@@ -144,14 +145,8 @@ def scale_of_motion(
     """
     late = _late(times, Rotation.from_matrix(T_world_camera[:, :3, :3] @ T_imu_camera[:3, :3].T), measured)
     times = times - late
-    is_inside = (times >= measured.times[0]) & (times <= measured.times[-1])
+    is_inside, parts = frames_measured(times, measured, source)
     at, poses = times[is_inside], T_world_camera[is_inside]
-    parts = _windows(at)
-    if sum(float(np.ptp(at[rows])) for rows in parts) < MIN_SECONDS:
-        raise ValueError(
-            f"{source}: of {len(times)} frames at {_span(times)} too few are within {_span(measured.times)} and less "
-            f"than {MAX_GAP:g} s apart for {MIN_SECONDS:g} s: times must be by the clock of the images, in seconds"
-        )
     dense, frames = _with_frames(measured, at)
     rotations = Rotation.from_matrix(poses[:, :3, :3] @ T_imu_camera[:3, :3].T)
     arms = poses[:, :3, :3] @ -(T_imu_camera[:3, :3].T @ T_imu_camera[:3, 3])
@@ -165,7 +160,27 @@ def scale_of_motion(
             f"{source}: the accelerations are not those of this path: check T_imu_camera, the axes and the clock"
         )
     unknowns, std, up, up_std = solved
+    if std > MAX_STD:
+        raise ValueError(
+            f"{source}: the accelerations tell no scale (± {100 * std:.0f} %): the path is too short or too even, or "
+            "they are not of it"
+        )
     return Motion(Scale(source, -float(unknowns[0]), std), up, up_std, bias + unknowns[4:7], unknowns[1:4], late)
+
+
+def frames_measured(
+    times: Float[np.ndarray, "n"], measured: Inertial, source: str
+) -> tuple[Bool[np.ndarray, "n"], list[np.ndarray]]:
+    """Which frames were measured, and the rows among these of each window; ValueError for less than `MIN_SECONDS`."""
+    is_inside = (times >= measured.times[0]) & (times <= measured.times[-1])
+    at = times[is_inside]
+    parts = _windows(at)
+    if sum(float(np.ptp(at[rows])) for rows in parts) < MIN_SECONDS:
+        raise ValueError(
+            f"{source}: of {len(times)} frames at {_span(times)} too few are within {_span(measured.times)} and less "
+            f"than {MAX_GAP:g} s apart for {MIN_SECONDS:g} s: times must be by the clock of the images, in seconds"
+        )
+    return is_inside, parts
 
 
 def _span(times: Float[np.ndarray, "n"]) -> str:

@@ -14,7 +14,7 @@ from emgs_jax.data.masks import files_of, names_of, stem
 from emgs_jax.ops.ranges import number
 from emgs_jax.scale.estimate import Scale, combined, scale_from
 from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_of, surfaces_of
-from emgs_jax.scale.inertial import Inertial, read_inertial, scale_of_motion
+from emgs_jax.scale.inertial import Inertial, frames_measured, read_inertial, scale_of_motion
 from emgs_jax.scale.positions import (
     is_geographic,
     positions_of_exif,
@@ -99,9 +99,41 @@ class Metres(NamedTuple):
     notes: tuple[str, ...]
 
 
+class Given(NamedTuple):
+    """The sources of a run, whose files are read; None for those that are not given."""
+
+    config: ScaleConfig
+    dataset: Dataset
+    tapes: tuple[int, ...]  # frame of each distance
+    positions: Float[np.ndarray, "n 3"] | None  # of all frames
+    is_z_up: bool  # of the positions, for sure
+    times: Float[np.ndarray, " n"] | None  # of all frames, seconds; None also where no source has times
+    inertial: Inertial | None
+    T_imu_camera: Float[np.ndarray, "4 4"] | None
+
+
+def read_given(config: ScaleConfig, dataset: Dataset) -> Given:
+    """Read the sources of a length; ValueError if one cannot be read, or is of other images than the data set's."""
+    given, names = config.positions, names_of(dataset) if config.distances else ()
+    tapes = tuple(_frame_of(str(image), names) for image, *_ in config.distances)
+    for _, *pixels, _ in config.distances:
+        _check_shown(pixels[:2], dataset)
+        _check_shown(pixels[2:], dataset)
+    is_file = given not in (None, "exif", "dataset")
+    is_timed = is_file or config.imu is not None
+    times = np.array([dataset[index].timestamp for index in range(len(dataset))]) if is_timed else None
+    positions = _positions(given, dataset, times)
+    is_z_up = given == "exif" or (is_file and is_geographic(Path(given).expanduser()))
+    found = Given(config, dataset, tapes, positions, is_z_up, times, None, None)
+    if config.imu is None:
+        return found
+    found = found._replace(inertial=read_inertial(config.imu), T_imu_camera=_mounted(config))
+    frames_measured(times, found.inertial, f"scale.imu={config.imu}")
+    return found
+
+
 def metres_of(
-    config: ScaleConfig,
-    dataset: Dataset,
+    given: Given,
     poses: Float[np.ndarray, "n 4 4"],
     world: Int[np.ndarray, " n"],
     view: Callable[[int], View],
@@ -116,12 +148,11 @@ def metres_of(
         scales: what else is known of each world's scale, such as by a network.
 
     Raises:
-        ValueError: a source cannot be read, or all say nothing of the largest world.
+        ValueError: the sources say nothing of the largest world, or no depth is known at a pixel.
     """
-    names, read = names_of(dataset), _read(config, dataset)
     found = []
     for one in range(max(world) + 1):
-        own, up, notes = _of_world(config, dataset, read, poses, np.flatnonzero(world == one), names, view)
+        own, up, notes = _of_world(given, poses, np.flatnonzero(world == one), view)
         own += filter(None, scales[one : one + 1])
         scale, warning = combined(own) if own else (None, None)
         found.append(Metres(scale, up, tuple(filter(None, [warning, *notes]))))
@@ -135,42 +166,18 @@ def metres_of(
     return found
 
 
-class Read(NamedTuple):
-    """What the files of the sources hold; None for those that are not given."""
-
-    positions: Float[np.ndarray, "n 3"] | None  # of all frames
-    is_z_up: bool  # of the positions, for sure
-    inertial: Inertial | None
-    T_imu_camera: Float[np.ndarray, "4 4"] | None
-
-
-def _read(config: ScaleConfig, dataset: Dataset) -> Read:
-    given = config.positions
-    positions = None if given is None else _positions(given, dataset)
-    is_z_up = given == "exif" or (given not in (None, "dataset") and is_geographic(Path(given).expanduser()))
-    if config.imu is None:
-        return Read(positions, is_z_up, None, None)
-    return Read(positions, is_z_up, read_inertial(config.imu), _mounted(config))
-
-
 def _of_world(
-    config: ScaleConfig,
-    dataset: Dataset,
-    read: Read,
-    all_poses: Float[np.ndarray, "n 4 4"],
-    frames: Int[np.ndarray, " k"],
-    names: Sequence[str],
-    view: Callable[[int], View],
+    given: Given, all_poses: Float[np.ndarray, "n 4 4"], frames: Int[np.ndarray, " k"], view: Callable[[int], View]
 ) -> tuple[list[Scale], Float[np.ndarray, "3"] | None, list[str]]:
     """Scales of a world by each source that is given, its up by the last that tells it, and notes."""
-    poses, focal = all_poses[frames], dataset.intrinsics[0]
+    config, dataset, poses = given.config, given.dataset, all_poses[frames]
     up, scales, notes = None, [], []
-    for image, *pixels, metres in config.distances:
-        frame = _frame_of(str(image), names)
+    for (image, *pixels, metres), frame in zip(config.distances, given.tapes, strict=True):
         if frame not in frames:
             notes.append(f"image {image} of scale.distance has no pose in this model")
             continue
-        ends = [_point(dataset, view, frame, pixels[k : k + 2]) for k in (0, 2)]
+        places = [dataset.pixel_of(frame, np.array(pixels[k : k + 2])) for k in (0, 2)]
+        ends = [point_at(*view(frame), place, np.array(dataset.intrinsics[:2])) for place in places]
         if None in ends:
             unknown = pixels[:2] if ends[0] is None else pixels[2:]
             raise ValueError(
@@ -180,31 +187,30 @@ def _of_world(
         points, stds = (np.stack(part) for part in zip(*ends, strict=True))
         world = [all_poses[frame][:3, :3] @ point + all_poses[frame][:3, 3] for point in points]
         stds = np.hypot(stds, [_spread(point, frames[frames != frame], all_poses, dataset, view) for point in world])
-        scales.append(scale_of_distance(points, stds, focal, float(metres), f"distance in {image}"))
+        scales.append(scale_of_distance(points, stds, dataset.intrinsics[0], float(metres), f"distance in {image}"))
     if config.height is not None:
         up, scale = _by_floor(config.height, frames, poses, view)
         scales += [] if scale is None else [scale]
         notes += ["no floor was found below the cameras"] if scale is None else []
-    if read.positions is not None:
+    if given.positions is not None:
         try:
-            placed = scale_of_positions(poses[:, :3, 3], read.positions[frames], "positions")
+            placed = scale_of_positions(poses[:, :3, 3], given.positions[frames], "positions")
         except ValueError as error:
             notes.append(str(error))
         else:
             scales.append(placed.scale)
             notes.append(f"{placed.num_used} positions fit within {placed.residual:.2g} m")
             z = placed.T_metres_world.rotation.T @ np.array([0.0, 0.0, 1.0])
-            is_up = read.is_z_up or z @ up_of_cameras(poses[:, :3, :3]) > np.cos(np.radians(MAX_LEAN_DEG))
+            is_up = given.is_z_up or z @ up_of_cameras(poses[:, :3, :3]) > np.cos(np.radians(MAX_LEAN_DEG))
             if placed.tilt_std_deg > MAX_TILT_STD_DEG:
                 notes.append("they lie along a line, which leaves up open")
             elif not is_up:
                 notes.append("their z axis is not up for the cameras, so they leave up open")
             else:
                 up = z
-    if read.inertial is not None:
-        times = np.array([dataset[int(frame)].timestamp for frame in frames])
+    if given.inertial is not None:
         try:
-            motion = scale_of_motion(times, poses, read.inertial, read.T_imu_camera, "imu")
+            motion = scale_of_motion(given.times[frames], poses, given.inertial, given.T_imu_camera, "imu")
         except ValueError as error:
             notes.append(str(error))
         else:
@@ -228,14 +234,10 @@ def _frame_of(image: str, names: Sequence[str]) -> int:
     )
 
 
-def _point(
-    dataset: Dataset, view: Callable[[int], View], frame: int, pixel: Sequence[float]
-) -> tuple[Float[np.ndarray, "3"], float] | None:
-    """The point at a pixel of a frame's image on disk, see `point_at`; ValueError for a pixel outside of that."""
-    (x, y), (width, height) = pixel, dataset.raw_size
+def _check_shown(pixel: Sequence[float], dataset: Dataset) -> None:
+    (width, height), (x, y) = dataset.raw_size, pixel
     if not (-0.5 <= x <= width - 0.5 and -0.5 <= y <= height - 0.5):
         raise ValueError(f"scale.distance: there is no pixel {[*pixel]} on disk: images are {width}x{height}")
-    return point_at(*view(frame), dataset.pixel_of(frame, np.array(pixel)), np.array(dataset.intrinsics[:2]))
 
 
 def _spread(
@@ -282,18 +284,23 @@ def _by_floor(
     return floor.normal, scale_from("height", height, middle, np.hypot(std, MIN_STD))
 
 
-def _positions(given: str, dataset: Dataset) -> Float[np.ndarray, "n 3"]:
+def _positions(
+    given: str | None, dataset: Dataset, times: Float[np.ndarray, " n"] | None
+) -> Float[np.ndarray, "n 3"] | None:
+    if given is None:
+        return None
     if given == "exif":
         return positions_of_exif(files_of(dataset)[0])
     if given == "dataset":
         return positions_of_poses([dataset.pose(index) for index in range(len(dataset))], dataset.name)
-    times = [dataset[index].timestamp for index in range(len(dataset))]
     return read_positions(Path(given).expanduser(), names_of(dataset), times)
 
 
 def _mounted(config: ScaleConfig) -> Float[np.ndarray, "4 4"]:
     """T_imu_camera as a matrix."""
     given = config.T_imu_camera
+    if isinstance(given, str) and not Path(given).expanduser().is_file():
+        raise ValueError(f"scale.T_imu_camera={given} is no file: give 16 numbers, or the camera's sensor.yaml")
     T = read_sensor(Path(given).expanduser())[1] if isinstance(given, str) else np.asarray(given, np.float64)
     if T.size != 16 or not np.allclose(T.reshape(4, 4)[:3, :3] @ T.reshape(4, 4)[:3, :3].T, np.eye(3), atol=1e-3):
         raise ValueError(f"scale.T_imu_camera must be the 16 numbers of a rigid motion, row by row, got {given}")

@@ -60,7 +60,7 @@ def positions_of_poses(poses: Sequence[Float[np.ndarray, "4 4"] | None], name: s
     if count < MIN_POSITIONS:
         raise ValueError(
             f"scale.positions=dataset: {count} of {len(found)} frames of {name} have a pose, and {MIN_POSITIONS} are "
-            "needed"
+            "needed: give the data set its poses, or a file of positions (scale.positions=FILE)"
         )
     return found.reshape(-1, 3)
 

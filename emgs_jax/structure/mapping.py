@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from jaxtyping import Float
 from tqdm import tqdm
 
 from emgs_jax.structure.config import StructureConfig
@@ -334,11 +335,16 @@ def filter_points(model: Any, config: StructureConfig, factor: float = 1.0) -> N
 def drop_points_at_cameras(model: Any) -> None:
     """Delete points at a camera that shows them: their rays determine nothing, and no covariance would be finite."""
     for image in [image for image in model.images.values() if image.has_pose]:
-        keys = sorted({point.point3D_id for point in image.points2D if point.has_point3D()})
-        pose = image.cam_from_world().matrix()
-        depths = np.array([pose[2, :3] @ model.points3D[key].xyz + pose[2, 3] for key in keys])
+        keys, depths = depths_seen(model, image)
         for key in np.array(keys)[depths < MIN_DEPTH * np.median(depths)] if keys else ():
             model.delete_point3D(int(key))
+
+
+def depths_seen(model: Any, image: Any) -> tuple[list[int], Float[np.ndarray, " k"]]:
+    """Keys and depths of the points that an image with a pose shows."""
+    keys = sorted({point.point3D_id for point in image.points2D if point.has_point3D()})
+    pose = image.cam_from_world().matrix()
+    return keys, np.array([pose[2, :3] @ model.points3D[key].xyz + pose[2, 3] for key in keys])
 
 
 def check_found(found: Sequence[Any], shots: Shots, config: StructureConfig, folder: Path) -> None:

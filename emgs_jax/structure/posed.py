@@ -21,6 +21,7 @@ from emgs_jax.structure.mapping import (
     Mapped,
     adjustment,
     cache_of,
+    depths_seen,
     drop_points_at_cameras,
     filter_points,
     leave_out,
@@ -47,7 +48,8 @@ def model_at(shots: Shots, config: StructureConfig, folder: Path) -> Mapped | No
     said, priors = [], _positions(model)
     for step, wide in enumerate(WIDE):
         model = _triangulated(model, config, folder, wide)
-        depth = _median_depth(model)
+        depths = np.concatenate([depths_seen(model, model.images[number])[1] for number in model.reg_image_ids()])
+        depth = float(np.median(depths)) if len(depths) else 1.0
         std = FIRST_STD * depth if step == 0 else max(_off(model, priors), LEAST_STD * depth)
         _adjust(model, shots, config, priors, std)
         filter_points(model, config, wide)
@@ -146,14 +148,3 @@ def _off(model: Any, priors: dict[int, Float[np.ndarray, "3"]]) -> float:
     placed = sorted({*priors} & {*model.reg_image_ids()})
     off = [camera_in_world(model.images[image])[:3, 3] - priors[image] for image in placed]
     return float(np.median(np.linalg.norm(off, axis=1))) / MEDIAN if off else 0.0
-
-
-def _median_depth(model: Any) -> float:
-    """Of the points that the images show; 1 without any."""
-    depths = []
-    for number in model.reg_image_ids():
-        image = model.images[number]
-        pose = image.cam_from_world().matrix()
-        keys = {point.point3D_id for point in image.points2D if point.has_point3D()}
-        depths += [pose[2, :3] @ model.points3D[key].xyz + pose[2, 3] for key in keys]
-    return float(np.median(depths)) if depths else 1.0

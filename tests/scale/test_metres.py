@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 
+import cv2
 import numpy as np
 import pytest
 from hydra.errors import InstantiationException
@@ -10,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from emgs_jax.config.configure import build, build_dataset, build_prior
 from emgs_jax.scale.estimate import Scale
-from emgs_jax.scale.metres import ScaleConfig, View, metres_of
+from emgs_jax.scale.metres import ScaleConfig, View, metres_of, read_given
 
 UNIT, HEIGHT, FOCAL, SIZE = 0.4, 1.5, 60.0, (80, 60)  # units of a metre; metres
 COUNT = 12
@@ -79,7 +80,7 @@ def on_floor(frame, pixel):
 
 
 def measured(tmp_path, config, **changed):
-    return metres_of(config, Photos(tmp_path), *structure(**changed), view)
+    return metres_of(read_given(config, Photos(tmp_path)), *structure(**changed), view)
 
 
 def angle(up):
@@ -106,7 +107,7 @@ def test_a_distance_where_frames_disagree_is_less_sure(tmp_path):
         return View((0.8 if frame == 3 else 1.0) * points, std)
 
     (right,) = measured(tmp_path, ScaleConfig(distance=tape()))
-    (found,) = metres_of(ScaleConfig(distance=tape()), Photos(tmp_path), *structure(), wrong)
+    (found,) = metres_of(read_given(ScaleConfig(distance=tape()), Photos(tmp_path)), *structure(), wrong)
     assert found.scale.log - right.scale.log == pytest.approx(-np.log(0.8), rel=0.05)
     assert right.scale.std < 0.045 and found.scale.std > 0.2
 
@@ -136,7 +137,7 @@ def test_positions_give_scale_and_up(tmp_path):
 def test_poses_of_the_data_set_give_scale_and_up(tmp_path):
     dataset = Photos(tmp_path)
     dataset.name, dataset.pose = "photos", lambda index: None if index == 4 else poses()[index]
-    (found,) = metres_of(ScaleConfig(positions="dataset"), dataset, *structure(), view)
+    (found,) = metres_of(read_given(ScaleConfig(positions="dataset"), dataset), *structure(), view)
     assert found.scale.factor == pytest.approx(1 / UNIT, rel=1e-4) and angle(found.up) < 0.1
     assert "11 positions fit" in found.notes[0]
 
@@ -148,7 +149,7 @@ def test_positions_in_a_world_whose_z_axis_is_not_up_leave_up_open(tmp_path):
         T = np.eye(4)
         T[:3, :3] = turned
         dataset.name, dataset.pose = "photos", lambda index, T=T: T @ poses()[index]
-        (found,) = metres_of(ScaleConfig(positions="dataset"), dataset, *structure(), view)
+        (found,) = metres_of(read_given(ScaleConfig(positions="dataset"), dataset), *structure(), view)
         assert found.up is None and any("leave up open" in note for note in found.notes)
         assert found.scale.factor == pytest.approx(1 / UNIT, rel=1e-4)
 
@@ -161,7 +162,7 @@ def test_positions_along_a_line_leave_up_open(tmp_path):
     T[:, :3, 3] = UNIT * (line + 1e-3 * rng.normal(size=line.shape)) @ TURN.T
     places = line + 0.02 * rng.normal(size=line.shape)
     path.write_text("".join(f"a{row:02}.jpg {' '.join(map(str, place))}\n" for row, place in enumerate(places)))
-    (found,) = metres_of(ScaleConfig(positions=str(path)), Photos(tmp_path), T, world, view)
+    (found,) = metres_of(read_given(ScaleConfig(positions=str(path)), Photos(tmp_path)), T, world, view)
     assert found.up is None and "they lie along a line, which leaves up open" in found.notes
     assert found.scale.factor == pytest.approx(1 / UNIT, rel=0.02)
 
@@ -189,13 +190,13 @@ def test_each_model_has_its_own_scale(tmp_path):
 def test_a_tape_outweighs_a_network_which_alone_gives_its_scale(tmp_path):
     network = Scale("the depth network", np.log(1.3 / UNIT), 0.2)
     world = [0] * 6 + [1] * 6
-    given = Photos(tmp_path), *structure(world), view, [network, network]
-    both = metres_of(ScaleConfig(distance=tape()), *given)
-    (by_tape,) = metres_of(ScaleConfig(distance=tape()), Photos(tmp_path), *structure([0] * 12), view)
+    tapes, nothing = (read_given(ScaleConfig(distance=one), Photos(tmp_path)) for one in (tape(), None))
+    both = metres_of(tapes, *structure(world), view, [network, network])
+    (by_tape,) = metres_of(tapes, *structure([0] * 12), view)
     assert both[0].scale.factor == pytest.approx(1 / UNIT, rel=0.02) and both[0].scale.std < by_tape.scale.std < 0.045
     assert both[1].scale.factor == pytest.approx(1.3 / UNIT) and both[1].scale.std == pytest.approx(0.2)
     assert both[0].scale.source.endswith("the depth network (± 20.0 %)")
-    alone = metres_of(ScaleConfig(), *given)
+    alone = metres_of(nothing, *structure(world), view, [network, network])
     assert [one.scale.factor for one in alone] == pytest.approx([1.3 / UNIT] * 2)
 
 
@@ -215,21 +216,49 @@ def test_a_pixel_outside_of_the_image_is_named(tmp_path):
 def test_no_floor_is_said(tmp_path):
     with pytest.raises(ValueError, match="no floor was found below the cameras"):
         metres_of(
-            ScaleConfig(height=1.5),
-            Photos(tmp_path),
+            read_given(ScaleConfig(height=1.5), Photos(tmp_path)),
             *structure(),
             lambda frame: View(*(np.zeros_like(part) for part in view(frame))),
         )
 
 
-def test_a_file_that_is_not_there_ends_a_run_whatever_else_is_known(tmp_path):
-    """A source that says nothing of a walk is a note; one that cannot be read is an error."""
-    with pytest.raises(ValueError, match="imu=.* is no file"):
-        measured(tmp_path, ScaleConfig(height=HEIGHT, imu=str(tmp_path / "none.csv"), T_imu_camera=np.eye(4).ravel()))
+def test_a_source_that_says_nothing_of_a_walk_is_a_note(tmp_path):
+    """The unit was at rest, and the frames turn."""
     path = tmp_path / "imu.csv"
-    path.write_text("\n".join(f"{100 + 0.005 * row} .1 0 0 0 0 9.81" for row in range(400)))
+    path.write_text("\n".join(f"{0.005 * row} .1 0 0 0 0 9.81" for row in range(3000)))
     (found,) = measured(tmp_path, ScaleConfig(height=HEIGHT, imu=str(path), T_imu_camera=np.eye(4).ravel()))
-    assert found.scale is not None and any("by the clock of the images" in note for note in found.notes)
+    assert found.scale is not None and any("tell no scale" in note for note in found.notes)
+
+
+IMU = "scale.imu={folder}/imu.csv", "scale.T_imu_camera=[1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1]"
+TAPE = "scale.distance=[{image},20,30,{column},30,1.5]"
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["scale.positions=dataset"], r"positions=dataset: 0 of 6 .* have a pose, and 4 .*\(scale.positions=FILE\)"),
+        (["scale.positions=exif"], "positions=exif: 0 of 6 images have a GPS position .* give a file of positions"),
+        (["scale.positions={folder}/none.txt"], "scale.positions=.*none.txt is no file: give one, exif or dataset"),
+        (["scale.positions={folder}/places.txt"], "0 of 6 images have a position, .* begin with b1, b2, b3"),
+        (["scale.imu={folder}/none.csv", IMU[1]], "scale.imu=.*none.csv is no file"),
+        (IMU, "scale.imu=.*imu.csv: of 6 frames at 0.000 to 5.000 s too few are within 100.000 to 109.995 s"),
+        ([IMU[0], "scale.T_imu_camera={folder}/none.yaml"], "scale.T_imu_camera=.*none.yaml is no file"),
+        ([TAPE.format(image="a9", column=40)], "image a9 is not in use: there are a0 to a5"),
+        ([TAPE.format(image="a2", column=90)], r"no pixel \[90, 30\] on disk: images are"),
+        (["scale.height=1.5", "scale.positions=exif"], "positions=exif: 0 of 6 images"),
+    ],
+)
+def test_a_source_that_is_not_there_ends_a_run_before_a_structure_is_made(tmp_path, words, message):
+    for row in range(6):
+        cv2.imwrite(str(tmp_path / f"a{row}.png"), np.full((48, 64, 3), 40 * row, np.uint8))
+    (tmp_path / "places.txt").write_text("b1 0 0 0\nb2 1 0 0\nb3 1 1 0\nb4 2 1 0\n")
+    (tmp_path / "imu.csv").write_text("\n".join(f"{100 + 0.005 * row} .1 0 0 0 0 9.81" for row in range(2000)))
+    images = f"dataset.root={tmp_path}", "dataset.intrinsics=[60,60,31.5,23.5]"
+    given = (word.replace("{folder}", str(tmp_path)) for word in words)
+    config = compose("prior=multiview_stereo", "dataset=images", *images, *given)
+    with pytest.raises(ValueError, match=message):
+        build_prior(config, build_dataset(config))
 
 
 @pytest.mark.parametrize(

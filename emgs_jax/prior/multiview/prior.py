@@ -37,7 +37,7 @@ from emgs_jax.prior.multiview.monocular_network import MeterConfig, way_of_meter
 from emgs_jax.prior.multiview.swept import SweptConfig, swept
 from emgs_jax.prior.sources import Sources, placed_beside, same_sources, sources_of
 from emgs_jax.scale.estimate import Scale
-from emgs_jax.scale.metres import ScaleConfig, View, metres_of
+from emgs_jax.scale.metres import Given, ScaleConfig, View, metres_of, read_given
 from emgs_jax.structure.config import StructureConfig
 from emgs_jax.structure.given import names_at
 from emgs_jax.structure.model import NONE, Structure, median_depth, scaled, without_worlds
@@ -96,6 +96,7 @@ class MultiviewStereo(Prior):
             settings["contents"] = {key: contents(path) for key, path in files.items()}
         self.provenance = Provenance("multiview_stereo", {"version": 15} | settings)
         self._dataset: Dataset | None = None
+        self._given: Given | None = None  # what `_metres` names
         self._folder: Path | None = None
         self._up_to: Callable[[int], Structure] | None = None  # of the frames up to this one, at least
         self._known: Structure | None = None
@@ -114,14 +115,14 @@ class MultiviewStereo(Prior):
         return 1 if self._config.online else window_size
 
     def check(self, dataset: Dataset, window_size: int) -> None:
-        """Take the data set; ValueError if it has fewer than three images, or the depths are not of them."""
+        """Take the data set; ValueError if it has fewer than three images, or depths or lengths are not of them."""
         if not self._config.online and wait_for_all(dataset) < 3:
             raise ValueError(
                 f"prior=multiview_stereo needs three images or more of one place, {dataset.name} {dataset.sequence} "
                 f"has {len(dataset)} in use: give more (dataset.stop, dataset.stride)"
             )
         self._way.check(dataset)
-        self._dataset = dataset
+        self._dataset, self._given = dataset, read_given(self._metres, dataset)
 
     def keep(self, folder: Path) -> None:
         """Make the structure in `folder`/structure, or load it from there.
@@ -245,7 +246,7 @@ class MultiviewStereo(Prior):
             points, confidence, _ = self._answer(frame)
             return View(points, 1.0 / confidence)
 
-        each = metres_of(self._metres, self._dataset, found.T_world_camera, found.world, view, scales)
+        each = metres_of(self._given, found.T_world_camera, found.world, view, scales)
         depths = self._depths
         factors = np.ones(len(each))
         for world, (scale, _, notes) in enumerate(each):
