@@ -1,6 +1,7 @@
 """Existence: evidence of later frames for and against a Gaussian, and merging of duplicate surfaces."""
 
 import math
+from functools import partial
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,11 +11,12 @@ import jaxlie
 from jaxtyping import Array, Bool, Float, Int
 
 from emgs_jax.gaussian_map import GaussianMap, without
-from emgs_jax.gaussians import Gaussians, blend, has_feature
+from emgs_jax.gaussians import blend, has_feature
 from emgs_jax.observation import Observation, depth_range
-from emgs_jax.ops.camera import NEAREST_DEPTH, Camera, nearest_pixel, project
+from emgs_jax.ops.camera import NEAREST_DEPTH, Camera
 from emgs_jax.ops.linalg import (
     dot,
+    inner,
     lower_entries,
     outer,
     quadratic,
@@ -25,10 +27,9 @@ from emgs_jax.ops.linalg import (
 from emgs_jax.ops.neighbours import group_points, nearest, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import choice, put_rows, static, take_rows, traced, where_rows
+from emgs_jax.sight import sight_of, views_through
 
-CLEAR = 2.0  # kσ of free space, which a surface does not open in one step when the depths of a network drift
 VIEW = 0.05  # radians between two views, whose errors are not the same
-BESIDE = 0.03  # of the width of an image, by which edges of a network, or of a pose, may be off
 MIN_GAP = 2.0  # standard deviations along the normal; two Gaussians closer than this are one thick sheet
 
 
@@ -89,26 +90,6 @@ class Look(NamedTuple):
     T_world_previous: jaxlie.SE3
 
 
-class Sight(NamedTuple):
-    """What a frame shows where each Gaussian is.
-
-    Args:
-        index: its pixel.
-        is_seen: whether the frame shows a surface there.
-        is_seen_through: whether the frame shows free space there, up to a surface farther than kσ behind.
-        reach: kσ (m).
-        depth: of the Gaussian, z (m).
-        variance: along its normal (m²).
-    """
-
-    index: Int[Array, "n"]
-    is_seen: Bool[Array, "n"]
-    is_seen_through: Bool[Array, "n"]
-    reach: Float[Array, "n"]
-    depth: Float[Array, "n"]
-    variance: Float[Array, "n"]
-
-
 class Seen(NamedTuple):
     """An earlier frame, in which later frames have found what moves.
 
@@ -158,7 +139,7 @@ def update_existence(
     only if it is as wide as a pixel: a view from afar does not have a point for each.
 
     So it takes many frames to remove what many have seen. What has changed between two visits goes sooner: `patience`
-    views in a row that clearly see through a Gaussian remove it, see `_views_through`. As frames from one place err
+    views in a row that clearly see through a Gaussian remove it, see `views_through`. As frames from one place err
     alike, a frame is as much of a view as the camera has moved since the one before, seen from the Gaussian: by the
     angle of its turn and that of its shift, up to `VIEW`.
 
@@ -173,7 +154,7 @@ def update_existence(
     view, T_world_camera, camera, depth_noise, T_world_previous = look
     gaussians = map.gaussians
     depths = depth_range(view, T_world_camera, camera)
-    sight = _sight(gaussians, depths, T_world_camera, camera, depth_noise, config)
+    sight = sight_of(gaussians, depths, T_world_camera, camera, depth_noise, config.num_std, config.min_cos)
     is_seen, is_seen_through = sight.is_seen, sight.is_seen_through
 
     spread = 0.5 * (jnp.trace(gaussians.covs, axis1=-2, axis2=-1) - sight.variance)  # variance along the surface
@@ -186,44 +167,12 @@ def update_existence(
     motion = jax.lax.stop_gradient(T_world_previous.inverse() @ T_world_camera)  # of which views are counted
     turn, shift = (jnp.linalg.norm(part) for part in (motion.rotation().log(), motion.translation()))
     share = jnp.minimum((turn + shift / jnp.maximum(sight.depth, NEAREST_DEPTH)) / VIEW, 1.0)
-    num_through = _views_through(map.num_through, share, sight, depths[0], camera)
+    # As printed, nothing is counted: the search beside each pixel takes half of the time of an update.
+    count, views = partial(views_through, camera=camera), (map.num_through, share, sight, depths[0])
+    num_through = jax.lax.cond(config.patience < jnp.inf, count, lambda before, *_: before, *views)
     is_gone = (existence < config.refuted) | (num_through >= config.patience)
     updated = eqx.tree_at(lambda m: (m.existence, m.num_through), map, (existence, num_through))
     return without(updated, is_gone), is_seen
-
-
-def _views_through(
-    before: Float[Array, "n"], share: Float[Array, "n"], sight: Sight, depth: Float[Array, "p"], camera: Camera
-) -> Float[Array, "n"]:
-    """Count the views in a row that clearly see through each Gaussian, see `GaussianMap.num_through`.
-
-    A look is clear if it shows free space farther than `CLEAR` kσ, and nothing as far away as the Gaussian within
-    `BESIDE` of the image's width: the edge of a surface that a network or a pose puts aside is no free space. Where
-    space opens in a smaller step the surface drifts, and no look counts until one sees it again.
-
-    Args:
-        share: of a view that this look is.
-        depth: nearest that the look shows around each pixel.
-    """
-    gap = depth[sight.index] - sight.depth
-    is_far = sight.is_seen_through & (gap > CLEAR * sight.reach)
-    is_clear = is_far & ~_is_beside(depth, sight, camera) & (before >= 0)
-    is_step = sight.is_seen_through & ~is_far & (before == 0)
-    return jnp.where(sight.is_seen, 0.0, jnp.where(is_step, -1.0, before + share * is_clear))
-
-
-def _is_beside(depth: Float[Array, "p"], sight: Sight, camera: Camera) -> Bool[Array, "n"]:
-    """Test whether a look shows something as far away as each Gaussian, within kσ, beside its pixel."""
-    image, ends = depth.reshape(camera.height, camera.width), (camera.height - 1, camera.width - 1)
-    pixel = jnp.divmod(sight.index, camera.width)
-    shifts = jnp.arange(-2, 3) * max(1, round(BESIDE * camera.width / 2))  # of depths over 3 × 3 pixels
-
-    def look_beside(found: Bool[Array, "n"], shift: tuple) -> tuple[Bool[Array, "n"], None]:
-        beside = image[tuple(jnp.clip(at + by, 0, end) for at, by, end in zip(pixel, shift, ends, strict=True))]
-        return found | (jnp.abs(beside - sight.depth) <= sight.reach), None
-
-    rows, columns = (shift.reshape(-1) for shift in jnp.meshgrid(shifts, shifts))
-    return jax.lax.scan(look_beside, jnp.zeros(sight.depth.shape, bool), (rows, columns))[0]
 
 
 @full_precision
@@ -236,38 +185,12 @@ def take_back(map: GaussianMap, seen: Seen, camera: Camera, config: ExistenceCon
         camera: of the frame's rows.
     """
     depths = jnp.where(seen.depth > 0, seen.depth, jnp.nan)
-    sight = _sight(map.gaussians, depths, seen.T_world_camera, camera, seen.depth_noise, config)
+    pose, gates = seen.T_world_camera, (config.num_std, config.min_cos)
+    sight = sight_of(map.gaussians, depths, pose, camera, seen.depth_noise, *gates)
     is_wrong = sight.is_seen & seen.moves[sight.index]
     existence = jnp.where(is_wrong, map.existence - config.hit - config.miss, map.existence)
     updated = eqx.tree_at(lambda m: m.existence, map, existence)
     return without(updated, is_wrong & (existence < config.refuted))
-
-
-def _sight(
-    gaussians: Gaussians,
-    depths: Float[Array, "2 p"],
-    T_world_camera: jaxlie.SE3,
-    camera: Camera,
-    depth_noise: Float[Array, ""],
-    config: ExistenceConfig,
-) -> Sight:
-    """Compare each Gaussian with a frame.
-
-    Args:
-        depths: that a frame shows around each pixel, see `depth_range`.
-    """
-    rotation = T_world_camera.rotation().as_matrix()
-    rays = gaussians.means - T_world_camera.translation()
-    pixels, depth = project(camera, rays @ rotation)
-    index, inside = nearest_pixel(pixels, (camera.height, camera.width))
-    nearest, farthest = depths[:, index]
-    variance = quadratic(lower_entries(gaussians.covs), jnp.unstack(gaussians.normals, axis=-1))
-    reach = config.num_std * jnp.sqrt((depth_noise * depth) ** 2 + variance)
-    is_steep = jnp.abs(inner(gaussians.normals, rays)) >= config.min_cos * jnp.linalg.norm(rays, axis=-1)
-    is_looked_at = gaussians.valid & inside & (depth > NEAREST_DEPTH) & is_steep
-    is_seen = is_looked_at & (jnp.minimum(jnp.abs(depth - nearest), jnp.abs(depth - farthest)) <= reach)
-    is_seen_through = is_looked_at & (depth < nearest - reach)
-    return Sight(index, is_seen, is_seen_through, reach, depth, variance)
 
 
 @full_precision
@@ -399,8 +322,3 @@ def nearest_layer(
 def along_surface(offsets: Float[Array, "*b 3"], normals: Float[Array, "*b 3"]) -> Float[Array, "*b 3"]:
     """Project each offset onto the plane orthogonal to its normal."""
     return offsets - inner(offsets, normals)[..., None] * normals
-
-
-def inner(first: Float[Array, "*b d"], second: Float[Array, "*#b d"]) -> Float[Array, "*b"]:
-    """Compute the inner product of each pair of vectors."""
-    return jnp.sum(first * second, axis=-1)

@@ -11,10 +11,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from emgs_jax.existence import MIN_GAP, ExistenceConfig, along_surface, inner, nearest_layer
+from emgs_jax.existence import MIN_GAP, ExistenceConfig, along_surface, nearest_layer
 from emgs_jax.gaussian_map import GaussianMap, without
 from emgs_jax.gaussians import Gaussians, has_feature
-from emgs_jax.ops.linalg import lower_entries, outer, quadratic, safe_normalize, whiten, whitened_entries
+from emgs_jax.ops.linalg import inner, lower_entries, outer, quadratic, safe_normalize, whiten, whitened_entries
 from emgs_jax.ops.neighbours import group_points, knn, nearest, order_of
 from emgs_jax.ops.precision import full_precision
 from emgs_jax.ops.pytree import where_rows

@@ -15,7 +15,7 @@ PACKAGE = Path(__file__).resolve().parents[1] / "emgs_jax"
 FILES = sorted(PACKAGE.rglob("*.py"))
 # From the bottom: a room imports rooms to its left and itself, never one to its right.
 CORE_ROOMS = (
-    *("ops", "observation", "gaussians", "gaussian_map", "registration", "pose_graph", "render"),
+    *("ops", "observation", "gaussians", "gaussian_map", "sight", "registration", "pose_graph", "render"),
     *("initialization", "localization", "em", "surface_extrapolation", "splitting", "refinement", "existence"),
     *("layers", "motion", "semantics", "slam"),
 )

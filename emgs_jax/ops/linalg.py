@@ -27,6 +27,11 @@ def safe_normalize(vectors: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
     return jnp.where(is_long, vectors / jnp.sqrt(jnp.where(is_long, squared, 1.0)), 0.0)
 
 
+def inner(first: Float[Array, "*b d"], second: Float[Array, "*#b d"]) -> Float[Array, "*b"]:
+    """Compute the inner product of each pair of vectors."""
+    return jnp.sum(first * second, axis=-1)
+
+
 def outer(vectors: Float[Array, "*b d"]) -> Float[Array, "*b d d"]:
     """Compute v v'."""
     return vectors[..., :, None] * vectors[..., None, :]
