@@ -23,6 +23,7 @@ MIN_SHARE = 0.5  # of the matches of an image, or of a pair, that do not contrad
 MIN_MATCHES = 15  # of a pair that counts
 NEAR = 5  # images apart in time, up to which a pair is believed
 BROKEN = 0.25  # share of a near pair's matches that are common points, below which it is broken; right ones have .4
+APART = 0.1  # likewise, below which nothing joins its images: wrong steps have none, photos around a thing .2
 
 
 class Evidence(NamedTuple):
@@ -92,6 +93,11 @@ class Judged(NamedTuple):
     def is_broken(self) -> Bool[np.ndarray, " p"]:
         """Near pairs whose images have hardly a point in common, though they match."""
         return self.is_near & (self.common < BROKEN * self.total)
+
+    @property
+    def is_apart(self) -> Bool[np.ndarray, " p"]:
+        """Broken pairs that are surely wrong, whatever pairs far apart in time say."""
+        return self.is_near & (self.common < APART * self.total)
 
     @property
     def counts(self) -> Bool[np.ndarray, " p"]:
@@ -182,7 +188,7 @@ def contradicted(model: Any, evidence: Evidence) -> list[int]:
 def joined(model: Any, evidence: Evidence) -> list[list[int]]:
     """The images of a model in groups that agreeing pairs join, the largest first.
 
-    Near pairs join first. Pairs far apart in time join two groups unless a near pair between them is broken.
+    Near pairs join first. Pairs far apart in time join two groups unless a near pair between them has no common points.
     """
     judged, images = judge(model, evidence), sorted(model.reg_image_ids())
     is_agreeing = (judged.loose >= MIN_SHARE * judged.total) & ~judged.is_broken
@@ -190,7 +196,7 @@ def joined(model: Any, evidence: Evidence) -> list[list[int]]:
     for a, b in judged.pairs[is_agreeing & judged.is_near].tolist():
         _join(group, group[a], group[b])
     for a, b in judged.pairs[is_agreeing & ~judged.is_near].tolist():
-        between = {frozenset((group[c], group[d])) for c, d in judged.pairs[judged.is_broken].tolist()}
+        between = {frozenset((group[c], group[d])) for c, d in judged.pairs[judged.is_apart].tolist()}
         if frozenset((group[a], group[b])) not in between:
             _join(group, group[a], group[b])
     groups = [[image for image in images if group[image] == one] for one in dict.fromkeys(group.values())]

@@ -1,6 +1,7 @@
 """What matches say of poses, and the mirror image of a structure; oracle: pycolmap's synthetic scenes."""
 
 import copy
+from types import SimpleNamespace
 
 import numpy as np
 import pycolmap
@@ -11,6 +12,7 @@ from emgs_jax.data.masks import stem
 from emgs_jax.structure import mapping, mirror
 from emgs_jax.structure.evidence import (
     Evidence,
+    Judged,
     contradicted,
     count_own,
     explained,
@@ -208,3 +210,13 @@ def test_models_that_their_matches_do_not_bear_out_or_of_a_few_points_are_left_o
         bent = turn(bent, image, 0.5 * image)  # 4 pixels
     models, said, *_ = told_apart([bent], evidence)
     assert models == [] and "it is left out" in said[-1]
+
+
+@pytest.mark.parametrize(("common", "groups"), [(16, [[1, 2, 3, 9]]), (2, [[1, 2], [3, 9]])])
+def test_far_pairs_join_images_unless_a_near_pair_shows_that_they_are_apart(monkeypatch, common, groups):
+    """Of 25 photos around a thing, one pair with a fifth of its matches as common points split off seven."""
+    pairs = np.array([(1, 2), (2, 3), (3, 9), (1, 9)])
+    total, is_near = np.array([100, 71, 100, 400]), np.array([True, True, True, False])
+    judged = Judged(pairs, total, total, total, total, np.array([60, common, 60, 0]), is_near)
+    monkeypatch.setattr("emgs_jax.structure.evidence.judge", lambda model, evidence: judged)
+    assert joined(SimpleNamespace(reg_image_ids=lambda: [1, 2, 3, 9]), None) == groups
