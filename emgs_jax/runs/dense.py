@@ -24,7 +24,6 @@ from emgs_jax.render.densify import DenseView, DensifyConfig, densify
 from emgs_jax.runs.labelling import LabelledMap
 from emgs_jax.runs.moving import moving_mask, with_moving
 
-MIN_COS = 0.3  # between a ray and the map's normal, as between a point's and its Gaussian's in registration
 _densify = eqx.filter_jit(densify)
 
 
@@ -85,7 +84,6 @@ def dense_map(
             stays &= True if is_out is None else ~is_out
             if config.points == "map":
                 drawn, is_drawn = (view.points, view.normals, image / 255.0), view.valid & stays
-                is_drawn &= ~grazes(view, run.poses[row])
                 yield PointCloud(*(values[is_drawn].astype(np.float64) for values in drawn))
             else:
                 points = run.records[row].scale * own[row]
@@ -99,15 +97,6 @@ def dense_map(
     points = cloud.points
     labels = None if labelled is None else LabelledPoints(points, labelled.classes_of(points), labelled.classes)
     return DenseMap(cloud, labels, pictures, rendered.metrics())
-
-
-def grazes(view: DenseView, pose: np.ndarray) -> np.ndarray:
-    """Tell which pixels' rays graze the map, (h, w).
-
-    A surface's error σ along its normal is σ / cos along a ray: a steeper view draws better what such a pixel shows.
-    """
-    rays = view.points - pose[:3, 3]
-    return np.abs(np.sum(rays * view.normals, axis=-1)) < MIN_COS * np.linalg.norm(rays, axis=-1)
 
 
 def uncontradicted(

@@ -89,18 +89,6 @@ def test_the_points_are_the_walls_with_its_normals_and_the_images_colours(dense)
     np.testing.assert_allclose(255.0 * colors, np.broadcast_to(number[:, None], colors.shape), atol=1e-9)
 
 
-def test_what_a_view_sees_at_a_grazing_angle_it_does_not_draw(run, dense, monkeypatch):
-    """The wall's normal is the cameras' axis, so what is left of each view is a circle."""
-    monkeypatch.setattr("emgs_jax.runs.dense.MIN_COS", 0.95)
-    steep = dense_map(run, Pictures(), densify_config(), evaluation_config(), num_pictures=0).cloud.points
-
-    def tangents(points: np.ndarray) -> np.ndarray:
-        return np.hypot(np.abs(points[:, :1] - XS).min(axis=1), points[:, 1]) / points[:, 2]
-
-    limit, before = np.tan(np.arccos(0.95)), tangents(dense.cloud.points)
-    assert tangents(steep).max() < limit < before.max() and len(steep) == (before < limit).sum()
-
-
 def test_pictures_are_of_frames_spread_evenly_over_those_that_are_not_lost(dense):
     assert [picture["title"] for picture in dense.pictures] == ["frame 0", "frame 2", "frame 5"]
     for picture, row in zip(dense.pictures, (0, 2, 5), strict=True):
