@@ -107,7 +107,7 @@ def test_a_map_in_another_unit_is_the_same_map(tmp_path, exact_run, monkeypatch,
         words = "prior=recorded", f"prior.folder={folder}"
     (tmp_path / "run").mkdir()
     metrics = run(compose(*words), tmp_path / "run")
-    assert "count 4 times, for the unit of the prior" in "".join(capsys.readouterr())
+    assert "count 4 times, for the unit of the map" in "".join(capsys.readouterr())
     there, here = np.load(tmp_path / "run" / "map.npz"), np.load(exact_run[0] / "map.npz")
     (means, stds), (others, expected) = (
         (found["gaussians.means"][rows], np.sqrt(np.linalg.eigvalsh(found["gaussians.covs"][rows])[:, 0]))
