@@ -10,6 +10,7 @@ import numpy as np
 
 from emgs_jax.data.base import Dataset, Frame
 
+SCALE_STD_KEY = "prior/scale_std_percent"  # in a report: how sure the metre is
 # In a report: up in the axes of a frame's camera, and the frame's index in the data set, as in frames.jsonl.
 UP_KEYS = "prior/up_x", "prior/up_y", "prior/up_z", "prior/up_frame"
 

@@ -26,7 +26,7 @@ from emgs_jax.mapping.merging import beside, join, motion, with_lost, without_re
 from emgs_jax.mapping.records import FrameRecord, to_line, with_moved_nodes, with_unjoined_apart
 from emgs_jax.mapping.run import MappingRun, with_truth
 from emgs_jax.ops.camera import Camera
-from emgs_jax.prior.base import UP_KEYS
+from emgs_jax.prior.base import SCALE_STD_KEY, UP_KEYS
 from emgs_jax.runs.dense import DenseMap, center_cloud, dense_map, voxel_of
 from emgs_jax.runs.files import save_outputs, save_progress
 from emgs_jax.runs.finished_run import FRAMES_FILE, POINTS_FILE, TEXT_FILE, FinishedRun, read_run
@@ -36,7 +36,6 @@ from emgs_jax.runs.provenance import git_now, write_metrics
 from emgs_jax.runs.repeat import repeat
 from emgs_jax.runs.results import METRICS_FILE
 
-SCALE_STD = "prior/scale_std_percent"
 OF_DATA = "name", "sequence"  # keys of a provenance's data
 MIN_SAME, MAX_MOVED = 0.5, 0.02  # keypoints that an image has again, and how far off, of its longer side
 
@@ -311,7 +310,7 @@ def save_merged(
 
 def world_of(metrics: Mapping[str, Any]) -> dict[str, Any]:
     """Choose what is known of the unit and of up in a run, whose world the merged one has."""
-    return {key: metrics[key] for key in (SCALE_STD, *UP_KEYS) if key in metrics}
+    return {key: metrics[key] for key in (SCALE_STD_KEY, *UP_KEYS) if key in metrics}
 
 
 def kept_cloud(parts: Sequence[MergeableRun], nodes: Sequence[Node], voxel: float) -> PointCloud:

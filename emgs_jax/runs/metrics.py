@@ -39,7 +39,7 @@ from emgs_jax.gaussians import Gaussians
 from emgs_jax.geometry import scale_pose
 from emgs_jax.mapping.records import APART, UNJOINED, UNPLACED, FrameRecord, longest_row, records_apart
 from emgs_jax.mapping.run import MappingRun, placed_percent, row_of_first_node, rows_with_truth, with_truth
-from emgs_jax.prior.base import Prior
+from emgs_jax.prior.base import SCALE_STD_KEY, Prior
 from emgs_jax.runs.back_end import counts, found_loops
 from emgs_jax.runs.gathering import Baselines, RawPrior, Text
 from emgs_jax.runs.provenance import PLACED_PERCENT, RAW_PRIOR, is_metric, prefixed
@@ -254,7 +254,7 @@ def scale_off(metrics: Metrics) -> Metrics:
 
     `trajectory/scale` is the factor to the truth: 1 for a map in right metres.
     """
-    std, factor = metrics.get("prior/scale_std_percent"), metrics.get("trajectory/scale")
+    std, factor = metrics.get(SCALE_STD_KEY), metrics.get("trajectory/scale")
     return {} if not std or not factor else {"trajectory/scale_off_std": abs(math.log(factor)) / (0.01 * std)}
 
 

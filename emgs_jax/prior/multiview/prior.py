@@ -25,7 +25,17 @@ from emgs_jax.data.masks import check_names, names_of
 from emgs_jax.data.reading import contents
 from emgs_jax.io.files import jsonable
 from emgs_jax.ops.camera import Camera
-from emgs_jax.prior.base import UP_KEYS, DenseView, Prior, PriorPrediction, Provenance, Window, no_points, predicted
+from emgs_jax.prior.base import (
+    SCALE_STD_KEY,
+    UP_KEYS,
+    DenseView,
+    Prior,
+    PriorPrediction,
+    Provenance,
+    Window,
+    no_points,
+    predicted,
+)
 from emgs_jax.prior.multiview.dense import DenseConfig, Depth, Scene, Way
 from emgs_jax.prior.multiview.depth import mean_difference
 from emgs_jax.prior.multiview.depth_files import DepthFilesConfig, way_of_files
@@ -149,7 +159,7 @@ class MultiviewStereo(Prior):
         if found is None:
             return {}
         placed = 100 * float(found.is_placed.mean())
-        known = {} if self._scale_std is None else {"prior/scale_std_percent": 100 * self._scale_std}
+        known = {} if self._scale_std is None else {SCALE_STD_KEY: 100 * self._scale_std}
         is_own = self._config.model is None and not self._config.online
         doubtful = doubtful_in(self._folder) if is_own else None
         if doubtful is not None:
