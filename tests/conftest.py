@@ -58,13 +58,31 @@ install_import_hook(
 )
 
 
+PASSED = "passed", set()  # in pytest's cache, and of this run
+
+
+def pytest_addoption(parser):
+    parser.addoption("--not-again", action="store_true", help="leave out what passed in the last run, as .ci/run does")
+
+
+def pytest_runtest_logreport(report):
+    if report.when == "call" and report.passed:
+        PASSED[1].add(report.nodeid)
+
+
+def pytest_sessionfinish(session):
+    if not hasattr(session.config, "workerinput"):  # which the processes of xdist have
+        session.config.cache.set(PASSED[0], sorted(PASSED[1]))
+
+
 @pytest.hookimpl(tryfirst=True)  # before `-m` chooses
 def pytest_collection_modifyitems(config, items):
     """Weekly tests are left out unless `-m` names them; groups of several files come first, as they take longest."""
-    if "weekly" not in config.option.markexpr:
-        left_out = [item for item in items if item.get_closest_marker("weekly")]
-        config.hook.pytest_deselected(items=left_out)
-        items[:] = [item for item in items if item not in set(left_out)]
+    passed = set(config.cache.get(PASSED[0], []) if config.option.not_again else [])
+    weekly = "weekly" in config.option.markexpr
+    left_out = [item for item in items if item.nodeid in passed or not weekly and item.get_closest_marker("weekly")]
+    config.hook.pytest_deselected(items=left_out)
+    items[:] = [item for item in items if item not in set(left_out)]
     items.sort(key=lambda item: item.get_closest_marker("xdist_group") is None)
 
 
