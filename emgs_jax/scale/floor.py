@@ -4,15 +4,17 @@ from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from scipy.spatial import cKDTree
 
 LEVEL_DEG = 15.0  # between up and the normal of a floor
-BIN = 0.02  # of the median distance of points and cameras: thickness of a level
+BIN = 0.05  # of the median height of cameras above flat patches: thickness of a level
 MIN_SHARE = 0.15  # of the largest level's area: what is lower than the floor is noise
+MAX_STEP = 0.25  # of the cameras' height above that level: what else may be the floor, where it or the cameras rise
 MIN_STD = 0.02  # of the logarithm of a height: the floor's own error
 TILT_DEG = 3.0  # standard deviation between up, as it was, and the normal of the floor
 MAX_OFF = 3.0  # standard deviations within which a patch is of the floor
 MAX_BEND = 0.025  # of the inverse depth of a patch, from the mean of opposite ones
-NUM_STEPS = 10  # of choosing the patches of the plane anew
+NUM_STEPS = 10  # of choosing the patches of a plane anew
 
 
 class Surfaces(NamedTuple):
@@ -25,9 +27,9 @@ class Surfaces(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """A plane below the cameras."""
+    """What lies below the cameras."""
 
-    normal: Float[np.ndarray, "3"]  # unit vector, up
+    normal: Float[np.ndarray, "3"]  # unit vector, up, the mean below the cameras
     heights: Float[np.ndarray, "c"]  # of the cameras above it
     std: float  # of a height that all cameras share, in the same unit
 
@@ -61,61 +63,93 @@ def surfaces_of(
     return Surfaces(here @ rotation.T + center, normals @ rotation.T, areas, np.full(len(areas), frame))
 
 
-def floor_of(surfaces: Surfaces, up: Float[np.ndarray, "3"], centers: Float[np.ndarray, "c 3"]) -> Floor | None:
-    """Fit a plane to the lowest large level below the cameras; None without one.
+def floor_of(
+    surfaces: Surfaces,
+    up: Float[np.ndarray, "3"],
+    centers: Float[np.ndarray, "c 3"],
+    path: Float[np.ndarray, "p 3"] | None = None,
+) -> Floor | None:
+    """Fit a plane to the lowest large level below each camera; None without one.
 
-    A floor is often seen only far from the cameras, where a degree of error in `up` changes its height by 2 % of the
-    distance. So heights are above its plane h = c + t·x, where x is horizontal, from the cameras' middle. Each frame
-    errs in all its patches alike, by their standard deviation about the plane; the slopes t are 0 ± `TILT_DEG`.
+    Ground rises and falls along a road, so each camera has a plane of its own, for which a patch at a horizontal
+    distance d counts 1 / (1 + (d/h)²)², where h is the height of the cameras above the level. A floor is often seen
+    only far from the cameras, where a degree of error in `up` changes its height by 2 % of the distance. So the plane
+    is h = c + t·x, where x is horizontal, from the camera. Each frame errs in all its patches alike, by their standard
+    deviation about the plane; the slopes t are 0 ± `TILT_DEG`.
+
+    Args:
+        centers: of the cameras that show the surfaces.
+        path: centers of all cameras of the walk; None: these.
     """
-    level = _level(surfaces, up, centers)
+    is_flat = surfaces.normals @ up >= np.cos(np.radians(LEVEL_DEG))
+    flat = Surfaces(*(part[is_flat] for part in surfaces))
+    across = np.linalg.svd(up[None])[2][1:]
+    level = _level(flat, up, across, centers if path is None else path)
     if level is None:
         return None
-    height, width = level
-    across = np.linalg.svd(up[None])[2][1:]
-    middle = np.median(centers @ across.T, axis=0)
-    is_flat, (points, _, areas, frames) = _is_flat(surfaces, up), surfaces
-    inputs, heights = np.column_stack([np.ones(len(points)), points @ across.T - middle]), points @ up
+    height, is_near = level
+    points, _, areas, frames = (part[is_near] for part in flat)
+    planes = []
+    for center in centers:
+        x = (points - center) @ across.T
+        inputs = np.column_stack([np.ones(len(x)), x])
+        counts = areas * _nearness(np.linalg.norm(x, axis=1), height)
+        plane, std = _plane(inputs, (points - center) @ up, counts, frames, 1e-3 * height)
+        normal = up - plane[1:] @ across
+        planes.append((normal, -plane[0] / np.linalg.norm(normal), std))
+    normals, heights, stds = (np.array(part) for part in zip(*planes, strict=True))
+    normal = normals.mean(axis=0)
+    return Floor(normal / np.linalg.norm(normal), heights, float(np.median(stds)))
+
+
+def _plane(
+    inputs: Float[np.ndarray, "n 3"],
+    heights: Float[np.ndarray, "n"],
+    counts: Float[np.ndarray, "n"],
+    frames: Int[np.ndarray, "n"],
+    min_std: float,
+) -> tuple[Float[np.ndarray, "3"], float]:
+    """Return c and t of h = c + t·x, without patches that lie off it, and the standard deviation of c."""
     prior = np.diag([0.0, 1.0, 1.0]) / np.tan(np.radians(TILT_DEG)) ** 2
-    plane, limit = np.array([height, 0.0, 0.0]), 2 * width
+    plane = np.array([_median(heights, counts), 0.0, 0.0])
     for _ in range(NUM_STEPS):
-        off = heights - inputs @ plane
-        near = is_flat & (np.abs(off) <= limit)
-        if not near.any():
-            return None
-        std = max(1.4826 * float(np.median(np.abs(off[near]))), 1e-3 * width)
-        of_frames = np.bincount(frames[near], areas[near])
-        weights = areas[near] * of_frames.sum() / np.sum(of_frames**2) / std**2  # Σ = number of frames / std²
+        off = np.abs(heights - inputs @ plane)
+        std = max(1.4826 * _median(off, counts), min_std)
+        near = off <= MAX_OFF * std
+        of_frames = np.bincount(frames[near], counts[near])
+        weights = counts[near] * of_frames.sum() / np.sum(of_frames**2) / std**2  # Σ = number of frames / std²
         information = (inputs[near] * weights[:, None]).T @ inputs[near] + prior
         plane = np.linalg.solve(information, (inputs[near] * weights[:, None]).T @ heights[near])
-        limit = min(2 * width, MAX_OFF * std)
-    normal = up - plane[1:] @ across
-    length = np.linalg.norm(normal)
-    above = centers @ up - plane[0] - (centers @ across.T - middle) @ plane[1:]
-    return Floor(normal / length, above / length, float(np.sqrt(np.linalg.inv(information)[0, 0])))
+    return plane, float(np.sqrt(np.linalg.inv(information)[0, 0]))
 
 
-def _is_flat(surfaces: Surfaces, up: Float[np.ndarray, "3"]) -> Bool[np.ndarray, "n"]:
-    return surfaces.normals @ up >= np.cos(np.radians(LEVEL_DEG))
+def _median(values: Float[np.ndarray, "n"], counts: Float[np.ndarray, "n"]) -> float:
+    order = np.argsort(values)
+    below = np.cumsum(counts[order])
+    return float(values[order][np.searchsorted(below, 0.5 * below[-1])])
+
+
+def _nearness(distance: Float[np.ndarray, "n"], height: float | Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    return 1 / (1 + (distance / height) ** 2) ** 2
 
 
 def _level(
-    surfaces: Surfaces, up: Float[np.ndarray, "3"], centers: Float[np.ndarray, "c 3"]
-) -> tuple[float, float] | None:
-    """Return the height along `up` of the lowest large level below the cameras, and the width of a level.
+    flat: Surfaces, up: Float[np.ndarray, "3"], across: Float[np.ndarray, "2 3"], path: Float[np.ndarray, "p 3"]
+) -> tuple[float, Bool[np.ndarray, "n"]] | None:
+    """Return the cameras' height above the lowest large level below them, and the patches that lie about as low.
 
-    A level is a bin of heights; its area is that of patches that lie flat. Points below the floor, mirrored or wrong,
-    are few.
+    A patch lies below the camera next to it. A level is a bin of these heights. Points below the floor, mirrored or
+    wrong, are few.
     """
-    heights, cameras = surfaces.points @ up, centers @ up
-    is_flat = _is_flat(surfaces, up) & (heights < np.median(cameras))
-    if not is_flat.any():
+    distance, camera = cKDTree(path @ across.T).query(flat.points @ across.T)
+    below = (path[camera] - flat.points) @ up
+    if not (below > 0).any():
         return None
-    width = BIN * float(np.median(np.median(cameras) - heights[is_flat]))
-    edges = np.arange(heights[is_flat].min() - width, np.median(cameras) + 2 * width, width)
-    area, _ = np.histogram(heights[is_flat], edges, weights=surfaces.areas[is_flat])
+    heights, distance, areas = (part[below > 0] for part in (below, distance, flat.areas))
+    width = BIN * float(np.median(heights))
+    edges = np.arange(0.0, heights.max() + 3 * width, width)
+    area, _ = np.histogram(heights, edges, weights=areas * _nearness(distance, heights))
     area = np.convolve(area, np.ones(3), "same")
     is_peak = (area >= np.roll(area, 1)) & (area >= np.roll(area, -1)) & (area >= MIN_SHARE * area.max())
-    lowest = edges[np.flatnonzero(is_peak)[0]] + 0.5 * width
-    near = is_flat & (np.abs(heights - lowest) <= 2 * width)
-    return float(np.average(heights[near], weights=surfaces.areas[near])), width
+    height = float(edges[np.flatnonzero(is_peak)[-1]] + 0.5 * width)
+    return height, np.abs(below - height) <= MAX_STEP * height

@@ -274,12 +274,12 @@ def _by_floor(
         step = max(round(max(points.shape[:2]) / PIXELS), 1)
         each.append(surfaces_of(points, poses[row], step, int(row)))
     surfaces = Surfaces(*(np.concatenate(part) for part in zip(*each, strict=True)))
-    up = up_of_surfaces(up_of_cameras(poses[:, :3, :3]), surfaces.normals, surfaces.areas)
-    floor = floor_of(surfaces, up, poses[:, :3, 3])
+    up = up_of_surfaces(up_of_cameras(poses[:, :3, :3]), surfaces.normals)
+    floor = floor_of(surfaces, up, poses[rows, :3, 3], poses[:, :3, 3])
     if floor is None:
         return None, None
     middle = float(np.median(floor.heights))
-    spread = 1.4826 * float(np.median(np.abs(floor.heights - middle))) / len(frames) ** 0.5
+    spread = 1.4826 * float(np.median(np.abs(floor.heights - middle))) / len(rows) ** 0.5
     std = np.hypot(spread, floor.std) / middle
     return floor.normal, scale_from("height", height, middle, np.hypot(std, MIN_STD))
 

@@ -60,18 +60,18 @@ def room(rng, count=4000):
 def test_floors_and_walls_improve_up():
     surfaces = room(np.random.default_rng(0))
     tilted = Rotation.from_euler("xy", [11, -9], degrees=True).apply(UP)
-    assert angle(up_of_surfaces(tilted, surfaces.normals, surfaces.areas), UP) < 0.5
+    assert angle(up_of_surfaces(tilted, surfaces.normals), UP) < 0.5
 
 
 def test_walls_alone_improve_up_in_their_direction():
     normals = np.tile([1.0, 0.0, 0.0], (50, 1))
     tilted = Rotation.from_euler("y", 8, degrees=True).apply(UP)
-    assert angle(up_of_surfaces(tilted, normals, np.ones(50)), UP) < 0.5
+    assert angle(up_of_surfaces(tilted, normals), UP) < 0.5
 
 
 def test_without_surfaces_up_stays():
     up = Rotation.from_euler("x", 5, degrees=True).apply(UP)
-    assert up_of_surfaces(up, np.zeros((0, 3)), np.zeros(0)) == pytest.approx(up)
+    assert up_of_surfaces(up, np.zeros((0, 3))) == pytest.approx(up)
 
 
 def test_the_floor_is_the_lowest_large_level():
@@ -114,6 +114,27 @@ def test_a_height_is_as_sure_as_the_floor_is_near_and_often_seen():
     assert few.std > 1.5 * many.std > 3 * above.std
 
 
+def test_the_ground_may_rise_and_fall_along_a_road():
+    """Symptom: on 50 m of a bending road the height was said to be 3.41 ± .34 m, by one plane for all cameras.
+
+    Here it is half a kilometre over hills, whose slopes are up to 4°, seen 3 to 15 m ahead of 24 cameras, with
+    ditches of 1.2 m at its sides.
+    """
+    rng, count = np.random.default_rng(0), 80
+    along = np.repeat(np.linspace(0, 500, 24), count)
+    places = np.column_stack([rng.uniform(-6, 6, len(along)), along + rng.uniform(3, 15, len(along))])
+    ground, slope = 4 * np.sin(places[:, 1] / 60), np.cos(places[:, 1] / 60) / 15
+    heights = ground - 1.2 * (np.abs(places[:, 0]) > 5.5) + 0.02 * rng.normal(size=len(along))
+    normals = np.column_stack([np.zeros(len(along)), -slope, np.ones(len(along))])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    frames = np.repeat(np.arange(24), count)
+    surfaces = Surfaces(np.column_stack([places, heights]), normals, np.ones(len(along)), frames)
+    path = np.column_stack([np.zeros(600), np.arange(600), 4 * np.sin(np.arange(600) / 60) + 1.65])
+    floor = floor_of(surfaces, UP, path[np.round(along[::count]).astype(int)], path)
+    assert np.median(floor.heights) == pytest.approx(1.65, rel=0.03) and angle(floor.normal, UP) < 3
+    assert floor.heights == pytest.approx(1.65, rel=0.15) and floor.std < 0.2
+
+
 def test_nothing_below_the_cameras_is_no_floor():
     surfaces = room(np.random.default_rng(2))
     assert floor_of(surfaces, UP, np.array([[0.0, 0.0, -3.0]])) is None
@@ -137,9 +158,9 @@ def test_surfaces_of_a_view_face_the_camera_and_have_its_pose():
 def test_surfaces_that_lead_far_from_the_cameras_up_are_not_followed():
     """A bank of 30° and little else."""
     bank = np.tile([0.0, np.sin(np.radians(30)), np.cos(np.radians(30))], (50, 1))
-    assert up_of_surfaces(UP, bank, np.ones(50)) == pytest.approx(UP)
+    assert up_of_surfaces(UP, bank) == pytest.approx(UP)
     gentle = np.tile([0.0, np.sin(np.radians(15)), np.cos(np.radians(15))], (50, 1))
-    assert angle(up_of_surfaces(UP, gentle, np.ones(50)), UP) == pytest.approx(15, abs=0.5)
+    assert angle(up_of_surfaces(UP, gentle), UP) == pytest.approx(15, abs=0.5)
 
 
 def test_a_road_that_a_level_camera_sees_at_a_slant_is_a_floor():
