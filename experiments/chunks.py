@@ -139,7 +139,8 @@ def words_of(config: DictConfig, part: range) -> list[str]:
     """Write the overrides by which a run maps some of the frames."""
     first, step = config.dataset.start, config.dataset.stride
     begin, stop = first + step * part[0], first + step * part[-1] + 1
-    return ["chunks=null", f"dataset.start={begin}", f"dataset.stop={stop}"]
+    place = [f"prior.first={part[0]}"] if "first" in config.prior else []  # of a simulated one
+    return ["chunks=null", f"dataset.start={begin}", f"dataset.stop={stop}", *place]
 
 
 def settings_of(config: DictConfig, words: Sequence[str]) -> dict[str, Any]:

@@ -70,6 +70,7 @@ def test_chunks_have_the_frames_that_the_keys_of_the_walk_choose(start, stop, st
         own = words_of(config, part)
         assert own[0] == "chunks=null"
         assert [frame.name for frame in build_dataset(compose(*words, *own[1:]))] == [whole[row] for row in part]
+        assert compose(*words, *own[1:]).prior.first == part[0]  # whatever start and stride are
 
 
 @pytest.mark.parametrize(
@@ -94,6 +95,11 @@ def test_chunks_of_other_images_are_not_taken_for_those_of_this_walk(tmp_path):
     check_same(path, walks[0])
     with pytest.raises(ValueError, match=r"chunks has chunks of other images: choose another hydra\.run\.dir="):
         check_same(path, walks[1])
+
+
+def test_only_a_simulated_prior_is_told_where_its_frames_are_in_the_walk():
+    config = configure.compose("dataset=images", "prior=multiview_stereo", "chunks=2")
+    assert words_of(config, range(3, 9)) == ["chunks=null", "dataset.start=3", "dataset.stop=9"]
 
 
 def test_a_camera_cannot_be_cut(tmp_path):
