@@ -20,13 +20,14 @@ from emgs_jax.config.overrides import written
 from emgs_jax.data.base import Dataset
 from emgs_jax.data.camera_models import Calibration
 from emgs_jax.data.intrinsics import Pictures, from_numbers
+from emgs_jax.data.readable import files_of_masks, fingerprint_with_masks
 from emgs_jax.io.files import owned, write_json
 from emgs_jax.report.page import write_report
 from emgs_jax.runs.files import claim_folder
 from emgs_jax.runs.finished_run import read_run
 from emgs_jax.runs.images import images_of
 from emgs_jax.runs.merging import mergeable, merged, save_merged
-from emgs_jax.runs.results import is_finished
+from emgs_jax.runs.results import is_finished, sound
 
 FOLDER, WALK = "chunks", "walk.json"  # below the run's, with a folder for each chunk; there: which images they are of
 
@@ -74,7 +75,7 @@ def run_chunks(
         return [row for row in range(len(parts)) if not is_finished(folders[row], settings[row], remedy)]
 
     with owned(folder):
-        check_same(folder / FOLDER / WALK, walk)
+        check_same(folder / FOLDER / WALK, fingerprint_of(config, walk))
         todo = undone()
         tqdm.write(f"{len(parts)} chunks of up to {max(map(len, parts))} frames, {len(todo)} of them to do")
         reasons = launch(folder / FOLDER, [[*words[row], f"hydra.sweep.subdir={row + 1}"] for row in todo], job)
@@ -98,13 +99,25 @@ def run_chunks(
     return metrics, problems
 
 
-def check_same(path: Path, walk: Dataset) -> None:
-    """Note which images the chunks are of; raise ValueError if finished ones are of others."""
-    found = {"fingerprint": walk.fingerprint()}
-    if path.exists() and json.loads(path.read_text(encoding="utf-8")) != found:
-        raise ValueError(f"{path.parent} has chunks of other images: choose another hydra.run.dir= or move it away")
+def fingerprint_of(config: DictConfig, walk: Dataset) -> str:
+    """The fingerprint of a walk with its masks, without reading its images."""
+    masks = build(config, "masks", _convert_="all")
+    files, whole = files_of_masks(walk, masks, config.on_bad_frame == "skip"), walk.fingerprint()
+    return fingerprint_with_masks(whole, files, masks.border) if any(files) else whole
+
+
+def check_same(path: Path, fingerprint: str) -> None:
+    """Note which images and masks the chunks are of; raise ValueError if finished ones are of others."""
+    if path.exists():
+        remedy = "if the images are those of its chunks, delete this file, else choose another hydra.run.dir="
+        with sound(f"{path} is damaged, and said of which images the chunks beside it are", remedy):
+            found = json.loads(path.read_text(encoding="utf-8"))["fingerprint"]
+        if found != fingerprint:
+            raise ValueError(
+                f"{path.parent} has chunks of other images or masks: choose another hydra.run.dir= or move it away"
+            )
     path.parent.mkdir(exist_ok=True)
-    write_json(path, found)
+    write_json(path, {"fingerprint": fingerprint})
 
 
 def check(config: DictConfig) -> None:
@@ -139,7 +152,8 @@ def words_of(config: DictConfig, part: range) -> list[str]:
     """Write the overrides by which a run maps some of the frames."""
     first, step = config.dataset.start, config.dataset.stride
     begin, stop = first + step * part[0], first + step * part[-1] + 1
-    return ["chunks=null", f"dataset.start={begin}", f"dataset.stop={stop}"]
+    place = [f"prior.first={part[0]}"] if "first" in config.prior else []  # of a simulated one
+    return ["chunks=null", f"dataset.start={begin}", f"dataset.stop={stop}", *place]
 
 
 def settings_of(config: DictConfig, words: Sequence[str]) -> dict[str, Any]:

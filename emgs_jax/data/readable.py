@@ -53,7 +53,7 @@ class ReadableFrames:
         if self._grows and masks.folder is not None:
             raise ValueError(f"masks.folder={masks.folder} cannot have masks of images that are still to come")
         may_skip = on_bad_frame == "skip"
-        self._masks, self._mask_files = masks, self._files_of_masks(dataset, masks, may_skip)
+        self._masks, self._mask_files = masks, files_of_masks(dataset, masks, may_skip)
         self.has_masks = any(self._mask_files)
         self.skipped = _unreadable(self._read, progress(indices)) if may_skip else {}
         self.kept = [index for index in indices if index not in self.skipped]
@@ -166,18 +166,6 @@ class ReadableFrames:
             )
         return note
 
-    @staticmethod
-    def _files_of_masks(dataset: Dataset, masks: Masks, may_lack: bool) -> list[tuple[Path, Path | None] | None]:
-        """The mask and the image file of each frame of the data set; None where it has no mask."""
-        if masks.folder is None:
-            own = getattr(dataset, "mask_file", lambda _: None)
-            found = [own(index) for index in range(len(dataset))]
-            return [path and (path, dataset.files(index)[0]) for index, path in enumerate(found)]
-        images, numbers = files_of(dataset)
-        found = masks.files(images, numbers, may_lack)
-        check_names(dataset, {stem(path.name) for path in masks.paths}, f"masks.folder={masks.folder}")
-        return [path and (path, image) for path, image in zip(found, images, strict=True)]
-
     def _left_out(self, index: int, size: tuple[int, int]) -> np.ndarray | None:
         """What the mask of the data set's frame leaves out of its image in this (width, height)."""
         if index >= len(self._mask_files) or self._mask_files[index] is None:
@@ -200,9 +188,29 @@ class ReadableFrames:
         """The data set's fingerprint, unless frames are left out."""
         whole = self._dataset.fingerprint()
         if self.has_masks:
-            masks = [hashlib.sha256(read_bytes(found[0])).hexdigest() for found in self._mask_files if found]
-            whole = hashlib.sha256(repr((whole, masks, self._masks.border)).encode()).hexdigest()
+            whole = fingerprint_with_masks(whole, self._mask_files, self._masks.border)
         return hashlib.sha256(repr((whole, tuple(self.kept))).encode()).hexdigest() if self.skipped else whole
+
+
+MaskFile = tuple[Path, Path | None]  # a mask and the file of its image
+
+
+def files_of_masks(dataset: Dataset, masks: Masks, may_lack: bool) -> list[MaskFile | None]:
+    """The mask of each frame of the data set, in the folder or its own; None where it has none."""
+    if masks.folder is None:
+        own = getattr(dataset, "mask_file", lambda _: None)
+        found = [own(index) for index in range(len(dataset))]
+        return [path and (path, dataset.files(index)[0]) for index, path in enumerate(found)]
+    images, numbers = files_of(dataset)
+    found = masks.files(images, numbers, may_lack)
+    check_names(dataset, {stem(path.name) for path in masks.paths}, f"masks.folder={masks.folder}")
+    return [path and (path, image) for path, image in zip(found, images, strict=True)]
+
+
+def fingerprint_with_masks(whole: str, files: Sequence[MaskFile | None], border: int) -> str:
+    """The fingerprint of frames and of their masks' contents; `whole` is that of the frames alone."""
+    masks = [hashlib.sha256(read_bytes(found[0])).hexdigest() for found in files if found]
+    return hashlib.sha256(repr((whole, masks, border)).encode()).hexdigest()
 
 
 def _unreadable(read: Callable[[int], Frame], indices: Iterable[int]) -> dict[int, str]:

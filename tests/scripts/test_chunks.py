@@ -3,6 +3,7 @@
 import json
 from pathlib import Path
 
+import cv2
 import numpy as np
 import own_process
 import pytest
@@ -18,7 +19,7 @@ from emgs_jax.mapping.window_input import first_pose
 from emgs_jax.runs.finished_run import read_run
 from emgs_jax.runs.images import images_of
 from experiments import chunks
-from experiments.chunks import check_same, cut, run_chunks, walk_of, words_of
+from experiments.chunks import check_same, cut, fingerprint_of, run_chunks, walk_of, words_of
 from experiments.run import run
 
 pytestmark = pytest.mark.xdist_group("tiny")
@@ -70,6 +71,7 @@ def test_chunks_have_the_frames_that_the_keys_of_the_walk_choose(start, stop, st
         own = words_of(config, part)
         assert own[0] == "chunks=null"
         assert [frame.name for frame in build_dataset(compose(*words, *own[1:]))] == [whole[row] for row in part]
+        assert compose(*words, *own[1:]).prior.first == part[0]  # whatever start and stride are
 
 
 @pytest.mark.parametrize(
@@ -88,12 +90,44 @@ def test_keys_of_one_run_are_refused(tmp_path, words, message):
 
 
 def test_chunks_of_other_images_are_not_taken_for_those_of_this_walk(tmp_path):
-    walks = [Synthetic(num_frames=6, size=[64, 48], seed=seed) for seed in (0, 1)]
+    walks = [Synthetic(num_frames=6, size=[64, 48], seed=seed).fingerprint() for seed in (0, 1)]
     path = tmp_path / "chunks" / "walk.json"
     check_same(path, walks[0])
     check_same(path, walks[0])
-    with pytest.raises(ValueError, match=r"chunks has chunks of other images: choose another hydra\.run\.dir="):
+    with pytest.raises(
+        ValueError, match=r"chunks has chunks of other images or masks: choose another hydra\.run\.dir="
+    ):
         check_same(path, walks[1])
+
+
+@pytest.mark.parametrize("text", ["", '{"fingerprint": "ab', "[]", "{}", "7"])
+def test_a_damaged_note_of_the_images_is_named_with_what_to_do(tmp_path, text):
+    """It ended with the words of the parser of json, which name no file."""
+    path = tmp_path / "walk.json"
+    path.write_text(text)
+    with pytest.raises(ValueError, match=rf"{path} is damaged.*: if the images are those of its chunks, delete this"):
+        check_same(path, "ab")
+    path.unlink()
+    check_same(path, "ab")
+    check_same(path, "ab")
+
+
+def test_other_masks_are_another_walk(tmp_path):
+    """Finished chunks of other masks were joined with new ones."""
+    config = compose("graph=default", f"masks.folder={tmp_path}")
+    (walk, plain) = walk_of(config), fingerprint_of(compose("graph=default"), walk_of(config))
+    for row in range(len(walk)):
+        assert cv2.imwrite(str(tmp_path / f"{row:06d}.png"), np.full((48, 64), 255, np.uint8))
+    first = fingerprint_of(config, walk)
+    assert first == fingerprint_of(config, walk) == build_dataset(config).fingerprint() != plain
+    assert cv2.imwrite(str(tmp_path / "000003.png"), np.eye(48, 64, dtype=np.uint8) * 255)
+    assert fingerprint_of(config, walk) not in (first, plain)
+    assert plain == walk.fingerprint(), "walks without masks are those of earlier versions"
+
+
+def test_only_a_simulated_prior_is_told_where_its_frames_are_in_the_walk():
+    config = configure.compose("dataset=images", "prior=multiview_stereo", "chunks=2")
+    assert words_of(config, range(3, 9)) == ["chunks=null", "dataset.start=3", "dataset.stop=9"]
 
 
 def test_a_camera_cannot_be_cut(tmp_path):

@@ -8,7 +8,8 @@
 - *Depth.* First flying points, then smooth warps and pixel noise on the log depth: a point stays on its pixel's ray.
 
 Every generator is seeded by (seed, stream, inference, frames), and processes over inferences are sums of the start of
-one stream. So one inference alone gives the same bits as a whole run.
+one stream. So one inference alone gives the same bits as a whole run. In a run of a part of a walk, what belongs to the
+images is drawn by their numbers in the walk, so that it is that of the whole; inferences have draws of their own.
 """
 
 import math
@@ -37,6 +38,7 @@ from emgs_jax.prior.simulated.truth import check_frames, no_truth, shared_points
 
 VERSIONS = (1, 2)
 REVISITS = 2**24  # more than any sequence has inferences
+WALKS = 2**48  # more than there are draws or seeds
 MAX_LEVEL = 100.0  # depths are then off by a factor of twenty
 
 
@@ -80,6 +82,7 @@ class Simulated(Prior):
         classes: names of the data set's labels; without them features have width 0.
         version: 1: the anchor holds every window, so nothing drifts; 2: only windows that share points with it.
         confusion: probability at level 1 that a class is taken for another.
+        first: number of the run's first frame in the walk of which it is a part.
     """
 
     def __init__(
@@ -90,6 +93,7 @@ class Simulated(Prior):
         classes: Sequence[str] = (),
         version: int = 1,
         confusion: float | int = 0.0,
+        first: int = 0,
     ) -> None:
         if version not in VERSIONS:
             raise ValueError(f"prior.version must be 1 (no drift) or 2 (drift beyond the anchor's view), got {version}")
@@ -101,11 +105,14 @@ class Simulated(Prior):
         if not 0 <= confusion <= 1:
             raise ValueError(f"prior.confusion is a probability, from 0 to 1, got {confusion}")
         self.level, self.seed, self.version, self.standard = float(level), int(seed), int(version), Standard()
-        self.confusion = float(confusion)
+        if not isinstance(first, int) or first < 0:
+            raise ValueError(f"prior.first is the number of a frame, 0 or more, got {first}")
+        self.confusion, self.first = float(confusion), first
         self.feature_names = tuple(classes)
         self.text_features = random_embeddings(self.feature_names, feature_size)
         settings = {"version": self.version, "level": self.level, "seed": self.seed}
         settings |= {"feature_size": self.text_features.shape[1]} | ({"confusion": self.confusion} if confusion else {})
+        settings |= {"first": first} if first else {}
         name = "simulated" if self.version == 1 else f"simulated v{self.version}"
         self.provenance = Provenance(name, settings, is_simulated=True)
 
@@ -134,10 +141,12 @@ class Simulated(Prior):
         """Predict with noise number `draw`; scale and window pose are processes over inferences."""
         compared = () if self.version == 1 else (window.views[0], window.views[_middle(window)])
         by_index = check_frames(window, frames, {*window.dense, *compared})
-        drift = autoregressive(self.seed, window.inference, self.standard.autocorrelation, 7)
+        of_run = WALKS * self.first
+        draw += of_run
+        drift = autoregressive(self.seed + of_run, window.inference, self.standard.autocorrelation, 7)
         scale = math.exp(self.level * self.standard.scale * drift[0])
         if self.version == 2:
-            scale *= math.exp(self.level * self.standard.scale_walk * random_walk(self.seed, window.inference))
+            scale *= math.exp(self.level * self.standard.scale_walk * random_walk(self.seed + of_run, window.inference))
         is_held = self.version == 1 or self._is_held(frames[0], frames[_middle(window)], intrinsics)
         T_anchor_view = self._poses(window, [frame.T_world_camera for frame in frames], drift[1:], is_held, draw)
         T_anchor_view[:, :3, 3] *= scale
@@ -175,7 +184,7 @@ class Simulated(Prior):
 
     def _pair(self, window: Window, left: int, T_true: np.ndarray, draw: int) -> np.ndarray:
         """The disturbed relative pose (4, 4) of the views `left` and `left + 1`."""
-        noise, pair = self.standard, window.views[left : left + 2]
+        noise, pair = self.standard, [self.first + index for index in window.views[left : left + 2]]
         xi = shared_normals((6,), (self.seed, Stream.PAIR, draw, *pair), noise.image_share)
         T_left_right = np.linalg.inv(T_true[left]) @ T_true[left + 1]
         return T_left_right @ rigid(xi, self.level * noise.pair_translation, self.level * noise.pair_rotation)
@@ -183,10 +192,11 @@ class Simulated(Prior):
     def _geometry(self, inference: int, frame: Frame, intrinsics: Sequence[float], scale: float) -> DenseView:
         depth = np.where(np.isfinite(frame.depth) & (frame.depth > 0), frame.depth, 0).astype(np.float32)
         mask = depth > 0
-        flown, near_edge = self._flying(inference, frame.index, depth)
-        log_change = self.level * self._log_noise(inference, frame.index, depth.shape)
+        index = self.first + frame.index
+        flown, near_edge = self._flying(inference, index, depth)
+        log_change = self.level * self._log_noise(inference, index, depth.shape)
         ratio = np.divide(flown, depth, out=np.ones_like(depth), where=mask)
-        confidence = self._confidence(inference, frame.index, np.abs(np.log(ratio) + log_change), near_edge)
+        confidence = self._confidence(inference, index, np.abs(np.log(ratio) + log_change), near_edge)
         disturbed = flown.astype(np.float64) * np.exp(log_change) * scale
         return backproject(disturbed, intrinsics).astype(np.float32), confidence, mask
 
@@ -233,7 +243,9 @@ class Simulated(Prior):
         share = min(1.0, self.level * self.confusion)
         features = self.text_features[confused(frame.labels, frame.T_world_camera, num_classes, share, self.seed)]
         if sigma > 0:
-            features += sigma * normals(features.shape, (self.seed, Stream.FEATURE, inference, frame.index))
+            features += sigma * normals(
+                features.shape, (self.seed, Stream.FEATURE, inference, self.first + frame.index)
+            )
             features /= np.maximum(np.linalg.norm(features, axis=-1, keepdims=True), 1e-12)
         features[frame.labels < 0] = 0
         return features.astype(np.float16)
