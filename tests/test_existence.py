@@ -264,6 +264,24 @@ def test_three_standard_deviations_decide(settings, offset, of_use, of_none):
         np.testing.assert_allclose(after.existence, {-1: -settings.miss, 0: 0.0, 1: settings.hit}[change])
 
 
+@pytest.mark.parametrize("of_normal", [0.003, 0.1])
+def test_what_is_thick_itself_is_on_the_surface_farther_from_it(settings, of_normal):
+    """Three standard deviations of the look and of the Gaussian along its normal: 18 and 35 cm at 3 m."""
+    gaussians = discs([(0, 0, 3.0 - offset) for offset in (0.15, 0.25, 0.4)])
+    covs = np.asarray(gaussians.covs) + np.diag([0.0, 0.0, of_normal**2])
+    after, is_seen = judged(map_of(replace(gaussians, covs=covs)), 1, look(3.0), HERE, CAMERA, NOISE, settings)
+    np.testing.assert_array_equal(is_seen, [True, of_normal > 0.01, False])
+    np.testing.assert_array_equal(after.existence > 0.5, is_seen)
+
+
+def test_evidence_beyond_its_limit_stays_until_a_look_says_something(settings):
+    """Births may be above the limit."""
+    beyond = float(settings.max_log_odds) + 3.0
+    map = map_of(discs([(0, 0, 3.0), (0, 0, 4.0)]), existence=beyond)
+    after, _ = judged(map, [1, 0], look(3.0), HERE, CAMERA, NOISE, settings)
+    np.testing.assert_allclose(after.existence, [settings.max_log_odds, beyond])
+
+
 def test_depth_range_is_of_the_pixel_and_its_neighbours():
     depth = np.full((CAMERA.height, CAMERA.width), 2.0)
     depth[10, 20], depth[30, 40] = 1.0, 5.0

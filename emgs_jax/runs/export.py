@@ -21,12 +21,13 @@ from emgs_jax.io.trajectory import load_trajectory_tum, save_trajectory_tum
 from emgs_jax.mapping.records import UNPLACED
 from emgs_jax.ops.ranges import number, one_of
 from emgs_jax.prior.base import UP_KEYS
-from emgs_jax.runs.finished_run import POINTS_FILE, FinishedRun
+from emgs_jax.runs.finished_run import POINTS_FILE, POLISHED_PATH_FILE, SPLATS_FILE, FinishedRun
 from emgs_jax.runs.moving import moving_mask
 
 FORMATS = {"colmap": "colmap", "nerfstudio": "nerfstudio", "frustums": "cameras.ply"}  # and what is written
 IMAGE_FORMATS = {"colmap", "nerfstudio"}
-TRAJECTORIES, CLOUDS = ("trajectory.txt", "trajectory_online.txt"), ("map.ply", "points.ply", "mesh.ply")
+TRAJECTORIES = "trajectory.txt", "trajectory_online.txt", POLISHED_PATH_FILE
+CLOUDS = "map.ply", "points.ply", "mesh.ply", SPLATS_FILE
 MOVED_FILE = "T_export_map.json"  # y = T x, a similarity, of points x of the run and y of the export
 SHORTEST = 1e-6  # of the run's unit; a shorter distance between two cameras does not determine a scale
 
@@ -170,7 +171,7 @@ def measured_up(run: FinishedRun) -> np.ndarray | None:
 
 
 def write_moved(run: FinishedRun, folder: Path, T_export_map: Sim3) -> FinishedRun:
-    """Write trajectories, map.npz, clouds and the similarity into an existing `folder`; return the run in that world.
+    """Write trajectories, map.npz, clouds, splats and the similarity into an existing `folder`; return the run there.
 
     Files that the run lacks are left out; truth and features stay.
     """

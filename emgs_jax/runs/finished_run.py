@@ -26,8 +26,8 @@ LOOPS_FILE = "loops.json"
 REPORT_FILE = "report.html"
 FRAMES_FILE = "frames.jsonl"
 POINTS_FILE = "points.ply"
-SPLATS_FILE = "splats.ply"
-POLISH = (SPLATS_FILE, "polish.json", "polish.png", "polish.npz", "polish.txt")  # of `experiments.polish`
+SPLATS_FILE, POLISHED_PATH_FILE = "splats.ply", "polish.txt"  # splats, and the poses to which they were fitted
+POLISH = (SPLATS_FILE, "polish.json", "polish.png", "polish.npz", POLISHED_PATH_FILE)  # of `experiments.polish`
 EXPORTS = ("colmap", "nerfstudio", "cameras.ply", "scaled", "upright")  # what `experiments.export` writes beside them
 _PROVENANCE = {"protocol": (str, type(None)), "simulated": bool, "git": (dict, type(None))} | {
     # The parts of `provenance.provenance` that are read again, by dotted key.

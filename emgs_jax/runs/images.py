@@ -27,12 +27,21 @@ def images_of(run: FinishedRun) -> tuple[ReadableFrames | None, str]:
     except OmegaConfBaseException as error:  # a key that the settings of older code lack
         return None, f"The images are not available: the run is of another version ({str(error).splitlines()[0]})."
     except (ValueError, OSError, InstantiationException) as error:
-        return None, f"The images are not available: {message_of(error)}"
+        return None, f"The images are not available: {message_of(error)}{_where(settings['dataset'].get('root'))}."
     if len(dataset) != count:
         return None, f"The images are not available: there are {len(dataset)} now, and {count} were mapped."
     if dataset.fingerprint() != run.provenance["data"]["fingerprint"]:
         return None, "The images are not available: they are not those that were mapped."
     return dataset, ""
+
+
+def _where(root: str | None) -> str:
+    """Say where images that have gone must be; empty if their folder is there, or they have none."""
+    if root is None or Path(root).expanduser().exists():
+        return ""
+    if Path(root).expanduser().is_absolute():
+        return f"; the run read them from {root}: put them, or a link to them, there"
+    return f"; the run read them from {root}, below the folder it was started in: repeat this command in that folder"
 
 
 class ImagesOfRuns(JoinedFrames):

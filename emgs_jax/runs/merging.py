@@ -302,15 +302,22 @@ def save_merged(
     notes = save_outputs(folder, run, dense, densify, title, evaluation.alignment == "sim3", unit)
     if parts[0].text is not None:
         save_text(folder / TEXT_FILE, parts[0].text)
-    metrics |= describe(run) | score_back_end(run) | world_of(parts[0].metrics) | {"provenance": origin}
+    metrics |= describe(run) | score_back_end(run) | world_of(parts[0], found.kept) | {"provenance": origin}
     write_metrics(folder / METRICS_FILE, metrics)
     apart = [f"{read[n].finished.folder} is not joined, and in submaps/ as it is: {why}" for n, why in reasons.items()]
     return metrics, [*apart, *notes, *filter(None, [note])]
 
 
-def world_of(metrics: Mapping[str, Any]) -> dict[str, Any]:
-    """Choose what is known of the unit and of up in a run, whose world the merged one has."""
-    return {key: metrics[key] for key in (SCALE_STD_KEY, *UP_KEYS) if key in metrics}
+def world_of(first: FinishedRun, kept: Sequence[int]) -> dict[str, Any]:
+    """Choose what is known of the unit and of up in the first run, whose world the merged one has.
+
+    Up is known by a frame, which gets its number in the merged run; `kept` is that of `Merged`.
+    """
+    known = {key: first.metrics[key] for key in (SCALE_STD_KEY, *UP_KEYS) if key in first.metrics}
+    index = known.get(UP_KEYS[-1])
+    rows = [row for row, frame in enumerate(first.frames) if frame["index"] == index]
+    number = {UP_KEYS[-1]: sum(one == row for row, one in enumerate(kept[: kept[rows[0]]]))} if rows else {}
+    return known | number
 
 
 def kept_cloud(parts: Sequence[MergeableRun], nodes: Sequence[Node], voxel: float) -> PointCloud:

@@ -30,11 +30,11 @@ from emgs_jax.polish.seeds import Seeds
 from emgs_jax.polish.splats import Anchors, Appearance, LossConfig, draw, gaussians_of, relative_gain, ssim
 from emgs_jax.render.composite import Rendering
 from emgs_jax.render.densify import DenseView, DensifyConfig, densify
-from emgs_jax.runs.finished_run import POLISH, SPLATS_FILE, FinishedRun
+from emgs_jax.runs.finished_run import POLISH, POLISHED_PATH_FILE, SPLATS_FILE, FinishedRun
 from emgs_jax.runs.moving import moving_mask
 from emgs_jax.semantics import classify
 
-_, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, PATH_FILE = POLISH
+_, METRICS_FILE, PICTURE_FILE, CHECKPOINT_FILE, _ = POLISH
 OPTAX = "optax", "splats are fitted by optax (polish=none fits none)", "polish"  # as `extra` takes it
 MAX_PICTURES = 4
 Seen: TypeAlias = tuple[np.ndarray, DenseView]  # image (h, w, 3) in [0, 1] of a frame, and the map from its pose
@@ -94,14 +94,15 @@ def polish(
     anchors, fitted = without_transparent(anchors, fitted, config.min_opacity)
     poses, all_gains = run.poses.copy(), _between(views.gains, fitted_rows, len(run.poses))
     poses[fitted_rows] = views.poses
+    (run.folder / POLISHED_PATH_FILE).unlink(missing_ok=True)  # of an earlier fit
     if config.poses:
         targets = Spool()
         for row in held:
             targets.append(target_of(*seen(row)))
         views = Views(targets, run.poses[held], _spreads(run, held, config), all_gains[held])
         poses[held] = place_on_splats(anchors, fitted, views, run.camera, config)
-        placed = np.flatnonzero(run.is_placed)
-        save_trajectory_tum(run.folder / PATH_FILE, [run.frames[row]["timestamp"] for row in placed], poses[placed])
+        times = [run.frames[row]["timestamp"] for row in rows]
+        save_trajectory_tum(run.folder / POLISHED_PATH_FILE, times, poses[rows])
     splats, opacity = gaussians_of(anchors, fitted)
     count = _save_splats(run, splats, opacity, nearest)
     metrics = {"polish/num_splats": count, "polish/num_fitted": len(fitted_rows), "polish/num_held_out": len(held)}

@@ -299,6 +299,9 @@ def test_what_is_held_out_never_enters_the_fit_and_the_files_say_what_came_out(f
     assert found["polish/num_held_out"] == 2 and found["polish/num_fitted"] == 4
     assert 0 < found["polish/after_ssim"] < 1 and found["polish/after_depth_within_5_percent"] > 75
     assert f"{found['polish/num_splats']:,} splats" in (folder / "report.html").read_text()
+    assert (folder / "polish.txt").is_file()
+    polish_run(config(*SHORT, "polish.poses=false", folder=folder))
+    assert not (folder / "polish.txt").exists(), "they are not the poses of these splats"
     run, settings = read_run(folder), build(config(*SHORT), "polish")
     densify = build(OmegaConf.create(dict(run.provenance["config"])), "densify")
     other = polish(run, Edited(images_of(run)[0], settings), settings, densify)

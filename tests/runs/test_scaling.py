@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from dataclasses import replace
 from functools import cache
 
@@ -191,6 +192,17 @@ def test_z_is_up_in_a_turned_export_of_all_files_alike_and_the_run_stays(run, ca
     np.testing.assert_allclose(
         np.asarray(map.gaussians.means)[valid], np.asarray(run.map.gaussians.means)[valid] @ T[:3, :3].T, atol=1e-5
     )
+
+
+def test_splats_and_their_poses_go_where_the_map_goes(run):
+    """Symptom: a polished run was turned and scaled without its splats. Oracle: the map's Gaussians beside them."""
+    shutil.copy(run.folder / "map.ply", run.folder / "splats.ply")
+    shutil.copy(run.folder / "trajectory.txt", run.folder / "polish.txt")
+    exported(run, up="z", scale=FACTOR, formats=[])
+    folder = run.folder / "scaled"
+    assert (folder / "splats.ply").read_bytes() == (folder / "map.ply").read_bytes()
+    assert (folder / "polish.txt").read_bytes() == (folder / "trajectory.txt").read_bytes()
+    assert (folder / "polish.txt").read_bytes() != (run.folder / "polish.txt").read_bytes()
 
 
 def test_up_is_that_of_the_source_which_told_the_scale(run):

@@ -17,6 +17,7 @@ from emgs_jax.geometry import Sim3, pose_difference
 from emgs_jax.loop_closure.place_recognition import Database, Keyframe, PlaceRecognitionConfig, make_keyframe
 from emgs_jax.mapping.merging import shared_placement, without_repeats
 from emgs_jax.mapping.records import FrameRecord
+from emgs_jax.prior.base import UP_KEYS
 from emgs_jax.runs.merging import first_placed, is_same_image, shared_frames, world_of
 
 
@@ -135,8 +136,25 @@ def test_a_merged_run_has_what_the_first_knows_of_its_unit_and_of_up():
         "prior/up_z": 0.0,
         "prior/up_frame": 1,
     }
-    assert world_of(known | {"prior/frames_without_pose": 3, "trajectory/scale": 1.0}) == known
-    assert world_of({"trajectory/scale": 1.0}) == {}
+    frames = [{"index": 0}, {"index": 1}, {"index": 2}]
+    run = SimpleNamespace(frames=frames, metrics=known | {"prior/frames_without_pose": 3, "trajectory/scale": 1.0})
+    assert world_of(run, range(6)) == known
+    assert world_of(SimpleNamespace(frames=frames, metrics={"trajectory/scale": 1.0}), range(6)) == {}
+
+
+@pytest.mark.parametrize(
+    ("indices", "kept", "number"),
+    [
+        pytest.param([0, 2, 3], range(6), 1, id="a frame before it was skipped"),
+        pytest.param([1, 2, 3], [4, 1, 2, 3, 4, 5], 0, id="the image before it is another run's"),
+        pytest.param([1, 2, 3], [0, 4, 2, 3, 4, 5], 3, id="its own image is another run's"),
+    ],
+)
+def test_up_in_a_merged_run_is_known_by_the_number_that_its_frame_has_there(indices, kept, number):
+    """Symptom: `emgs export up=z` took the camera of another frame."""
+    up = dict(zip(UP_KEYS, (0.0, -1.0, 0.0, 2), strict=True))
+    run = SimpleNamespace(frames=[{"index": index} for index in indices], metrics=up)
+    assert world_of(run, kept) == up | {UP_KEYS[-1]: number}
 
 
 def test_joined_images_are_shown_once():
