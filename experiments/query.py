@@ -29,7 +29,6 @@ from emgs_jax.report.query_pictures import (
     views_of,
 )
 from emgs_jax.runs.finished_run import FinishedRun, read_run
-from emgs_jax.runs.provenance import is_metric
 from emgs_jax.runs.query import Question, ask, write_answer
 from emgs_jax.runs.vocabulary import Vocabulary, feature_model, vocabulary, words_of
 
@@ -62,7 +61,7 @@ def query(config: DictConfig) -> dict[str, Any]:
     draw_features(folder / FEATURES_PICTURE, run, chosen)
     if config.label_images:
         save_labels(folder / LABELS_FOLDER, run, answer, named_views(run, views))
-    print("\n".join(lines_of(said, "m" if is_metric(run.provenance["prior"].get("settings", {})) else "units")))
+    print("\n".join(lines_of(said, "m" if run.is_metric else "units")))
     about = said["features"]
     print(
         f"{about['num_gaussians']} Gaussians, {about['num_with_feature']} with a feature of width {about['width']}: "

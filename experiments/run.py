@@ -249,7 +249,7 @@ def _write(
     """
     clock, (evaluation, densify) = run.clock, configs
     with ThreadPoolExecutor(2, "raw prior") as threads:
-        truth = threads.submit(new_scorer, dataset, evaluation, prior)
+        truth = threads.submit(new_scorer, dataset, evaluation, prior, unit == "m")
         of_prior = threads.submit(lambda: score_prior(run, raw, truth.result()))
         with clock.phase("export"):
             save_progress(folder, run)

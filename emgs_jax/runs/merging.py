@@ -296,7 +296,7 @@ def save_merged(
         dense = replace(dense, cloud=kept_cloud(joined, found.run.atlas.graph.nodes, voxel))
     metrics = {}
     if dataset is not None:
-        scorer = Scorer(dataset, evaluation, true_cloud(dataset, evaluation), None, None)
+        scorer = Scorer(dataset, evaluation, true_cloud(dataset, evaluation), None, None, parts[0].is_metric)
         metrics = score_map(run, dense.cloud, center_cloud(run), None, scorer) | dense.rendering
     title, unit = f"{len(order) - len(reasons)} runs merged", "m" if parts[0].is_metric else "units"
     notes = save_outputs(folder, run, dense, densify, title, evaluation.alignment == "sim3", unit)

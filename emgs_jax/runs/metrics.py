@@ -42,7 +42,7 @@ from emgs_jax.mapping.run import MappingRun, placed_percent, row_of_first_node, 
 from emgs_jax.prior.base import SCALE_STD_KEY, Prior
 from emgs_jax.runs.back_end import counts, found_loops
 from emgs_jax.runs.gathering import Baselines, RawPrior, Text
-from emgs_jax.runs.provenance import PLACED_PERCENT, RAW_PRIOR, is_metric, prefixed
+from emgs_jax.runs.provenance import PLACED_PERCENT, RAW_PRIOR, prefixed
 
 Metrics = dict[str, Any]
 STATUSES = ("tracked", "degraded", "lost", APART, "initialization")
@@ -57,20 +57,16 @@ class Scorer:
     truth: Reference  # empty without ground truth
     labels: LabelledPoints | None  # the true classes; None where data set or prior have none
     prior: Prior | None  # its text embeddings are the classes of a map
-
-    @property
-    def is_metric(self) -> bool:
-        """Whether the prior states that it predicts in metres."""
-        return self.prior is None or is_metric(self.prior.provenance.settings)
+    is_metric: bool  # lengths of the map are meant to be metres
 
 
-def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior) -> Scorer:
+def new_scorer(dataset: ReadableFrames, evaluation: EvaluationConfig, prior: Prior, is_metric: bool) -> Scorer:
     """Read the truth of a data set, reading each frame once."""
     labels = None
     if compared_text(dataset, prior) is not None:
         labels = TrueLabels(dataset, evaluation.voxel_m, evaluation.max_depth_m)
     truth = true_cloud(dataset, evaluation, labels)
-    return Scorer(dataset, evaluation, truth, labels and labels.points(), prior)
+    return Scorer(dataset, evaluation, truth, labels and labels.points(), prior, is_metric)
 
 
 def compared_text(dataset: ReadableFrames, prior: Prior) -> Text | None:
@@ -97,7 +93,7 @@ def score_map(
     """Compute trajectory, reconstruction and segmentation metrics of the map; empty without any true pose.
 
     The dense map is compared as the protocol says; under the other alignment as `reconstruction_<alignment>/…`; aligned
-    by ICP as `reconstruction_icp/…`; and the centres alone as `reconstruction_centers/…`. If the prior's unit is not
+    by ICP as `reconstruction_icp/…`; and the centres alone as `reconstruction_centers/…`. If the map's unit is not
     the metre, there is no comparison without scale: the distances would only reflect the unit.
     """
     poses, truth, config = with_truth(run, run.poses), scorer.truth, scorer.evaluation
@@ -110,7 +106,7 @@ def score_map(
     if other.alignment == "sim3" or scorer.is_metric:
         compared = compare_clouds(dense, truth, poses, other)
     else:
-        compared = not_compared(other, "the prior's unit is not the metre") | {"reconstruction/alignment_note": None}
+        compared = not_compared(other, "the map's unit is not the metre") | {"reconstruction/alignment_note": None}
     metrics |= _renamed(compared, f"reconstruction_{other.alignment}/")
     metrics |= _renamed(compare_clouds(centers, truth, poses, config), "reconstruction_centers/")
     return metrics | _score_labels(labels, poses, scorer)

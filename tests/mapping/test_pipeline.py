@@ -198,7 +198,7 @@ def test_without_ground_truth_everything_but_metrics_comes_out(tmp_path):
     assert save_outputs(tmp_path, blind, dense, config, "blind", True) == []
     names = {"map.ply", "points.ply", "mesh.ply", "overview.png"}
     assert {path.name for path in tmp_path.iterdir()} == names
-    scorer = new_scorer(dataset(), protocol, EditedPrior())
+    scorer = new_scorer(dataset(), protocol, EditedPrior(), True)
     raw = RawPrior(dense.cloud, Spool())
     assert score_map(blind, dense.cloud, dense.cloud, None, scorer) == score_prior(blind, raw, scorer) == {}
     assert dense.rendering == {}

@@ -141,7 +141,7 @@ def test_baselines_are_compared_at_the_poses_that_they_were_built_at(gathered):
     run, baselines, raw = gathered
     config = evaluation_config("evaluation.alignment=se3")
     truth = reference(ground_truth_cloud([Walls()[row] for row in (0, 1)], INTRINSICS, config), config)
-    metrics = score_baselines(run, baselines, raw, Scorer(Walls(), config, truth, None, None))
+    metrics = score_baselines(run, baselines, raw, Scorer(Walls(), config, truth, None, None, True))
     for name in CONFIGS:
         assert metrics[f"baseline_{name}_ours/reconstruction/accuracy_m"] < 0.05
         assert metrics[f"baseline_{name}_ours/reconstruction_icp/f1_20cm_percent"] > 95.0
@@ -154,7 +154,7 @@ def test_baselines_are_compared_at_the_poses_that_they_were_built_at(gathered):
         assert metrics[f"baseline_{name}_raw/rendering/depth_within_5_percent"] == pytest.approx(20.0, abs=4.0)
         assert metrics[f"baseline_{name}_ours/rendering/psnr_db"] > 40.0
     run.true_poses = [None] * len(STATUSES)
-    assert score_baselines(run, baselines, raw, Scorer(Walls(), config, truth, None, None)) == {}
+    assert score_baselines(run, baselines, raw, Scorer(Walls(), config, truth, None, None, True)) == {}
 
 
 @pytest.mark.parametrize("metres_per_unit", [0.001, 3.0, 30.0, 1000.0])

@@ -50,7 +50,7 @@ class Scene:
         self.labels = LabelledPoints(self.cloud.points, (self.cloud.points[:, 0] > 0).astype(int), CLASSES)
 
     def scorer(self) -> Scorer:
-        return Scorer(Blind(), self.config, reference(self.cloud, self.config), self.labels, None)
+        return Scorer(Blind(), self.config, reference(self.cloud, self.config), self.labels, None, True)
 
     def run(self, **changes):
         run = hand_run(self.ours.inverse().apply_to_poses(self.poses), self.raw_poses(), self.poses)
@@ -133,13 +133,12 @@ def test_the_dense_map_is_also_compared_under_the_other_alignment(alignment, oth
 @pytest.mark.parametrize("alignment", ["sim3", "se3"])
 def test_a_map_whose_unit_is_not_the_metre_is_compared_without_scale_only_where_the_protocol_asks(alignment):
     scene = Scene(f"evaluation.alignment={alignment}")
-    prior = SimpleNamespace(provenance=SimpleNamespace(settings={"structure": {"scale": "arbitrary"}}))
     run, dense = scene.run(), transform_cloud(scene.cloud, scene.ours.inverse())
-    unknown = score_map(run, dense, dense, None, dataclasses.replace(scene.scorer(), prior=prior))
+    unknown = score_map(run, dense, dense, None, dataclasses.replace(scene.scorer(), is_metric=False))
     known = score_map(run, dense, dense, None, scene.scorer())
     if alignment == "sim3":
         rigid = {key for key in known if key.startswith("reconstruction_se3/")}
-        assert unknown["reconstruction_se3/reason"] == "the prior's unit is not the metre"
+        assert unknown["reconstruction_se3/reason"] == "the map's unit is not the metre"
         assert rigid and all(unknown[key] is None for key in rigid)
         known = {key: value for key, value in known.items() if key not in rigid}
     assert {key: unknown[key] for key in known} == known
@@ -198,15 +197,15 @@ class Dark(Room):
 
 def test_the_truth_is_that_of_every_frame_and_its_labels_where_the_prior_has_classes():
     prior = SimpleNamespace(feature_names=CLASSES, text_features=np.eye(len(CLASSES)))
-    scorer = new_scorer(Room(), evaluation_config(), prior)
+    scorer = new_scorer(Room(), evaluation_config(), prior, True)
     for x in (0.0, 4.0, 8.0):
         assert (np.abs(scorer.truth.cloud.points[:, 0] - x) < 1.2).sum() == 48
     np.testing.assert_allclose(scorer.truth.cloud.points[:, 2], 2.0)
     np.testing.assert_array_equal(scorer.labels.labels, np.abs(scorer.labels.points[:, 0] - 4.0) < 1.2)
-    assert new_scorer(Room(), evaluation_config(), SimpleNamespace(feature_names=())).labels is None
+    assert new_scorer(Room(), evaluation_config(), SimpleNamespace(feature_names=()), True).labels is None
     blind = Room()
     blind.has_ground_truth = False
-    assert len(new_scorer(blind, evaluation_config(), prior).truth.cloud) == 0
+    assert len(new_scorer(blind, evaluation_config(), prior, True).truth.cloud) == 0
 
 
 def records(*rows):

@@ -46,6 +46,17 @@ def test_the_one_chair_and_the_one_picture_are_found_where_they_are(exact_run, t
         assert sum(counts) < 0.2 * found["features"]["num_gaussians"]
 
 
+def test_a_map_that_kept_its_own_unit_is_not_asked_in_metres(exact_run, tmp_path, capsys):
+    """Symptom: a saved map of an own unit that was continued with predictions in metres."""
+    folder = shutil.copytree(exact_run[0], tmp_path / "run")
+    for unit, said in ((True, ") m, "), (False, ") units, ")):
+        metrics = json.loads((folder / "metrics.json").read_text())
+        metrics["provenance"]["is_metric"] = unit
+        (folder / "metrics.json").write_text(json.dumps(metrics))
+        query(configure.compose(f"map={folder}", "text=chair", f"out={tmp_path / said[2]}", name="query"))
+        assert said in capsys.readouterr().out
+
+
 def test_segment_says_of_labelled_frames_what_the_run_itself_said(exact_run, tmp_path):
     folder, metrics = exact_run
     config = configure.compose(f"map={folder}", "truth=frames", f"out={tmp_path}", name="segment")

@@ -16,6 +16,7 @@ from tiny_run import NUM_FRAMES, TINY, WINDOW_SIZE, EditedPrior, compose, datase
 import experiments.run
 from emgs_jax.data.base import BadFrameError
 from emgs_jax.data.synthetic import Synthetic
+from emgs_jax.device.clock import Clock
 from emgs_jax.gaussian_map import confirmed
 from emgs_jax.io.map_file import load_map
 from emgs_jax.io.ply_reader import read_vertices
@@ -238,3 +239,15 @@ def test_a_map_that_is_continued_keeps_its_unit(tmp_path, capsys, unit, continue
     assert ("has a unit of its own and keeps it" in capsys.readouterr().out) == (not expected)
     assert is_in_metres({**block, "prior": {"settings": metric}, "is_metric": expected}) == expected
     assert experiments.run.unit_of_map(None, today) == (3.0, {})
+
+
+@pytest.mark.parametrize("unit", ["m", "units"])
+def test_a_map_is_scored_in_metres_only_if_it_has_them(monkeypatch, tmp_path, unit):
+    """Symptom: a continued map of an own unit had errors without scale, as its prior has metres."""
+    asked = []
+    monkeypatch.setattr(experiments.run, "new_scorer", lambda *words: asked.append(words))
+    monkeypatch.setattr(experiments.run, "score_prior", lambda *_: {})
+    monkeypatch.setattr(experiments.run, "save_progress", lambda *_: 1 / 0)  # the rest is of no interest here
+    with pytest.raises(ZeroDivisionError):
+        experiments.run._write(SimpleNamespace(clock=Clock()), None, None, None, None, (None, None), tmp_path, unit)
+    assert asked == [(None, None, None, unit == "m")]

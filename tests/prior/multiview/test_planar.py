@@ -7,7 +7,14 @@ import pytest
 from stereo_scene import CENTER, SIZE, depth_config, painted, planar_config, small_camera, sources
 
 from emgs_jax.prior.multiview.depth import estimate_depth
-from emgs_jax.prior.multiview.planar import _prediction_std, blank_regions, fill_planes, fit_plane
+from emgs_jax.prior.multiview.planar import (
+    _filled,
+    _prediction_std,
+    blank_regions,
+    fill_planes,
+    fit_plane,
+    fit_planes,
+)
 
 pytestmark = pytest.mark.slow
 
@@ -129,6 +136,31 @@ def test_the_plane_is_that_of_the_majority():
     expected = np.linalg.lstsq(pixels[~wrong], inverse[~wrong], rcond=None)[0]
     np.testing.assert_array_equal(chosen, ~wrong)
     np.testing.assert_allclose(plane, expected, atol=1e-9)
+
+
+@pytest.mark.parametrize(("num_scattered", "count"), [(45, 1), (60, 0)])
+def test_scattered_matches_are_no_further_plane(num_scattered, count):
+    """Of 200; three quarters must lie on planes of at least 50, and some of the scattered ones always agree."""
+    rng = np.random.default_rng(5)
+    pixels = np.column_stack([rng.uniform(-0.5, 0.5, (200, 2)), np.ones(200)])
+    inverse = pixels @ [5.0, -3.0, 12.0]
+    inverse[:num_scattered] += rng.uniform(3, 20, num_scattered)
+    assert len(fit_planes(pixels, inverse, planar_config())) == count
+
+
+def test_between_two_planes_the_odds_are_those_of_the_squared_distances_to_their_matches():
+    """Without errors, matched at either end: the one that is not taken is as far away as it lies from the other."""
+    v, u = np.mgrid[:20, :41]
+    near, pixels = (u < 3) | (u > 37), np.stack([u / 41 - 0.5, v / 41 - 0.5, np.ones(u.shape)], -1)
+    first, second = 20.0 + 30.0 * pixels[..., 1], 24.0 - 30.0 * pixels[..., 1]
+    truth = np.where(u < 20, first, second)
+    config = planar_config("prior.dense.planar.tolerance=0.001")
+    found, std = (values.reshape(u.shape) for values in _filled(u >= 0, near, pixels, truth, config))
+    away = u != 20
+    np.testing.assert_allclose(found[away], truth[away])
+    gap, (to_first, to_second) = np.abs(first - second), np.maximum([u - 2.0, 38.0 - u], 0.5)
+    far, close = np.maximum(to_first, to_second), np.minimum(to_first, to_second)
+    np.testing.assert_allclose(std, gap * np.sqrt(far**-2 / (far**-2 + close**-2)), rtol=1e-5)
 
 
 @pytest.mark.parametrize("correlation", [1.0, 3.0])
