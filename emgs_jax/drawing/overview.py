@@ -79,7 +79,7 @@ def view_from_above(poses: np.ndarray, normals: np.ndarray | None = None, up: np
     if normals is not None and not is_known:
         some = normals[:: len(normals) // MAX_NORMALS + 1].astype(np.float64)
         lengths = np.linalg.norm(np.nan_to_num(some), axis=1)
-        up = up_of_surfaces(up, some[lengths > 0] / lengths[lengths > 0, None])
+        up = up_of_surfaces(up, some[lengths > 0] / lengths[lengths > 0, None], np.ones(np.sum(lengths > 0)))
     centers = poses[:, :3, 3] - poses[:, :3, 3].mean(0)
     flat = centers - np.outer(centers @ up, up)
     # The path's longest direction points right; a camera at rest looks up the picture.

@@ -63,6 +63,17 @@ def surfaces_of(
     return Surfaces(here @ rotation.T + center, normals @ rotation.T, areas, np.full(len(areas), frame))
 
 
+def certainties(surfaces: Surfaces, centers: Float[np.ndarray, "c 3"]) -> Float[np.ndarray, "n"]:
+    """Return 1 / σ² of the normals, up to a factor: depths err by a share of themselves, over the width of a patch.
+
+    By areas alone the farthest patches, of trees and banks, would count most, and are the least certain.
+
+    Args:
+        centers: of the cameras, by the numbers of the frames.
+    """
+    return surfaces.areas / np.sum((surfaces.points - centers[surfaces.frames]) ** 2, axis=1)
+
+
 def floor_of(
     surfaces: Surfaces,
     up: Float[np.ndarray, "3"],

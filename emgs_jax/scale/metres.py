@@ -13,7 +13,7 @@ from emgs_jax.data.euroc import read_sensor
 from emgs_jax.data.masks import files_of, names_of, stem
 from emgs_jax.ops.ranges import number
 from emgs_jax.scale.estimate import Scale, combined, scale_from
-from emgs_jax.scale.floor import MIN_STD, Surfaces, floor_of, surfaces_of
+from emgs_jax.scale.floor import MIN_STD, Surfaces, certainties, floor_of, surfaces_of
 from emgs_jax.scale.inertial import Inertial, frames_measured, read_inertial, scale_of_motion
 from emgs_jax.scale.positions import (
     is_geographic,
@@ -274,7 +274,7 @@ def _by_floor(
         step = max(round(max(points.shape[:2]) / PIXELS), 1)
         each.append(surfaces_of(points, poses[row], step, int(row)))
     surfaces = Surfaces(*(np.concatenate(part) for part in zip(*each, strict=True)))
-    up = up_of_surfaces(up_of_cameras(poses[:, :3, :3]), surfaces.normals)
+    up = up_of_surfaces(up_of_cameras(poses[:, :3, :3]), surfaces.normals, certainties(surfaces, poses[:, :3, 3]))
     floor = floor_of(surfaces, up, poses[rows, :3, 3], poses[:, :3, 3])
     if floor is None:
         return None, None

@@ -24,16 +24,18 @@ def up_of_cameras(rotations: Float[np.ndarray, "n 3 3"]) -> Float[np.ndarray, "3
     return -up if up @ down > 0 else up
 
 
-def up_of_surfaces(up: Float[np.ndarray, "3"], normals: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
+def up_of_surfaces(
+    up: Float[np.ndarray, "3"], normals: Float[np.ndarray, "n 3"], weights: Float[np.ndarray, "n"]
+) -> Float[np.ndarray, "3"]:
     """Improve a direction by floors, tables and ceilings, whose normals are along it, and walls, across it.
 
-    With w = exp(-θ² / 2 width²) of the angle θ to exactly along or across, u minimizes Σ_walls w (n·u)² - Σ_floors w
-    (n·u)²; the width falls from step to step. Normals count alike, however large the surface: outdoors the largest are
-    the farthest, whose normals are the least certain.
+    With w = exp(-θ² / 2 width²) of the angle θ to exactly along or across, and the weights a, u minimizes
+    Σ_walls a w (n·u)² - Σ_floors a w (n·u)²; the width falls from step to step.
 
     Args:
         up: unit vector, within about 20° of the truth.
         normals: unit vectors.
+        weights: as 1 / σ², up to a factor.
 
     Returns:
         The direction as it was, if surfaces lead farther from it than that: outdoors, trees and banks do.
@@ -41,7 +43,7 @@ def up_of_surfaces(up: Float[np.ndarray, "3"], normals: Float[np.ndarray, "n 3"]
     before = up
     for width in np.radians(WIDTHS_DEG).repeat(NUM_STEPS):
         angle = np.arccos(np.clip(np.abs(normals @ up), 0.0, 1.0))
-        along, across = (np.exp(-0.5 * (off / width) ** 2) for off in (angle, np.pi / 2 - angle))
+        along, across = (weights * np.exp(-0.5 * (off / width) ** 2) for off in (angle, np.pi / 2 - angle))
         if not along.any() and not across.any():
             return up
         open_as_before = OPEN * (along.sum() + across.sum()) * np.outer(up, up)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from emgs_jax.scale.floor import Surfaces, floor_of, surfaces_of
+from emgs_jax.scale.floor import Surfaces, certainties, floor_of, surfaces_of
 from emgs_jax.scale.up import up_of_cameras, up_of_surfaces
 
 
@@ -60,18 +60,18 @@ def room(rng, count=4000):
 def test_floors_and_walls_improve_up():
     surfaces = room(np.random.default_rng(0))
     tilted = Rotation.from_euler("xy", [11, -9], degrees=True).apply(UP)
-    assert angle(up_of_surfaces(tilted, surfaces.normals), UP) < 0.5
+    assert angle(up_of_surfaces(tilted, surfaces.normals, surfaces.areas), UP) < 0.5
 
 
 def test_walls_alone_improve_up_in_their_direction():
     normals = np.tile([1.0, 0.0, 0.0], (50, 1))
     tilted = Rotation.from_euler("y", 8, degrees=True).apply(UP)
-    assert angle(up_of_surfaces(tilted, normals), UP) < 0.5
+    assert angle(up_of_surfaces(tilted, normals, np.ones(50)), UP) < 0.5
 
 
 def test_without_surfaces_up_stays():
     up = Rotation.from_euler("x", 5, degrees=True).apply(UP)
-    assert up_of_surfaces(up, np.zeros((0, 3))) == pytest.approx(up)
+    assert up_of_surfaces(up, np.zeros((0, 3)), np.zeros(0)) == pytest.approx(up)
 
 
 def test_the_floor_is_the_lowest_large_level():
@@ -158,9 +158,20 @@ def test_surfaces_of_a_view_face_the_camera_and_have_its_pose():
 def test_surfaces_that_lead_far_from_the_cameras_up_are_not_followed():
     """A bank of 30° and little else."""
     bank = np.tile([0.0, np.sin(np.radians(30)), np.cos(np.radians(30))], (50, 1))
-    assert up_of_surfaces(UP, bank) == pytest.approx(UP)
+    assert up_of_surfaces(UP, bank, np.ones(50)) == pytest.approx(UP)
     gentle = np.tile([0.0, np.sin(np.radians(15)), np.cos(np.radians(15))], (50, 1))
-    assert angle(up_of_surfaces(UP, gentle), UP) == pytest.approx(15, abs=0.5)
+    assert angle(up_of_surfaces(UP, gentle, np.ones(50)), UP) == pytest.approx(15, abs=0.5)
+
+
+def test_banks_far_away_do_not_turn_up():
+    """Symptom: a bank of 17°, ten times as far as the road, turned up by 15°."""
+    road, bank = np.tile(UP, (10, 1)), np.tile([0.0, np.sin(np.radians(17)), np.cos(np.radians(17))], (10, 1))
+    points = np.concatenate([np.tile([0.0, 4.0, -1.5], (10, 1)), np.tile([0.0, 40.0, 0.0], (10, 1))])
+    areas = np.repeat([0.01, 0.3], 10)  # far ones are seen more from in front
+    surfaces = Surfaces(points, np.concatenate([road, bank]), areas, np.zeros(20, int))
+    weights = certainties(surfaces, np.zeros((1, 3)))
+    assert angle(up_of_surfaces(UP, surfaces.normals, weights), UP) < 4
+    assert angle(up_of_surfaces(UP, surfaces.normals, areas), UP) > 14
 
 
 def test_a_road_that_a_level_camera_sees_at_a_slant_is_a_floor():
