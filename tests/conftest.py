@@ -58,7 +58,8 @@ install_import_hook(
 )
 
 
-PASSED = "passed", set()  # in pytest's cache, and of this run
+LAST = "passed"  # where pytest's cache has what passed in the last run
+PASSED = set()  # in this one
 
 
 def pytest_addoption(parser):
@@ -67,18 +68,19 @@ def pytest_addoption(parser):
 
 def pytest_runtest_logreport(report):
     if report.when == "call" and report.passed:
-        PASSED[1].add(report.nodeid)
+        PASSED.add(report.nodeid)
 
 
 def pytest_sessionfinish(session):
-    if not hasattr(session.config, "workerinput"):  # which the processes of xdist have
-        session.config.cache.set(PASSED[0], sorted(PASSED[1]))
+    # The processes of xdist have `workerinput`; there is no cache with `-p no:cacheprovider`.
+    if not hasattr(session.config, "workerinput") and hasattr(session.config, "cache"):
+        session.config.cache.set(LAST, sorted(PASSED))
 
 
 @pytest.hookimpl(tryfirst=True)  # before `-m` chooses
 def pytest_collection_modifyitems(config, items):
     """Weekly tests are left out unless `-m` names them; groups of several files come first, as they take longest."""
-    passed = set(config.cache.get(PASSED[0], []) if config.option.not_again else [])
+    passed = set(config.cache.get(LAST, []) if config.option.not_again else [])
     weekly = "weekly" in config.option.markexpr
     left_out = [item for item in items if item.nodeid in passed or not weekly and item.get_closest_marker("weekly")]
     config.hook.pytest_deselected(items=left_out)
